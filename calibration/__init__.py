@@ -1,0 +1,1 @@
+"""Where the cameras stand and how they see colour."""

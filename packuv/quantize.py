@@ -1,0 +1,172 @@
+"""Float attributes of Gaussians <-> the integers that a scene file stores.
+
+Every channel decodes through a table, so a decoded value is the same float32 on every machine.
+Positions are 16-bit on a symmetric-log scale about the scene's centre, the rest is 8-bit and uniform
+(paper, appendix "Low-Precision Training").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+SCALE = slice(0, 3)
+"""Columns of `Codes.attributes`: natural log of the three standard deviations."""
+ROTATION = slice(3, 6)
+"""x, y, z of the unit quaternion whose w >= 0."""
+OPACITY = 6
+"""Opacity logit. Code 0 decodes below the 1/255 that every renderer skips: an absent Gaussian."""
+DC = slice(7, 10)
+"""SH band 0, r g b."""
+REST = 10
+"""First column of the SH bands above 0, coefficient by coefficient, r g b each."""
+
+OPACITY_RANGE = (-5.6, 7.0)
+"""Logit of codes 0 and 255; logit(1/255) is -5.537."""
+
+
+def attribute_count(sh_degree: int) -> int:
+    """Number of 8-bit columns at this SH degree."""
+    return 7 + 3 * (sh_degree + 1) ** 2
+
+
+@dataclass(frozen=True)
+class Codes:
+    """N Gaussians as integers."""
+
+    xyz: np.ndarray
+    """uint16 [N, 3]"""
+    attributes: np.ndarray
+    """uint8 [N, A], columns as named above"""
+
+    def __post_init__(self) -> None:
+        if self.xyz.dtype != np.uint16 or self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
+            raise ValueError(f"positions must be uint16 [N, 3], but are {self.xyz.dtype} {self.xyz.shape}")
+        if self.attributes.dtype != np.uint8 or self.attributes.shape[:-1] != (len(self.xyz),):
+            raise ValueError(
+                f"attributes must be uint8 [{len(self.xyz)}, A], but are "
+                f"{self.attributes.dtype} {self.attributes.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def __getitem__(self, rows: np.ndarray | slice) -> Codes:
+        return Codes(self.xyz[rows], self.attributes[rows])
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians as float32 arrays, in the conventions of 3D Gaussian Splatting."""
+
+    means: np.ndarray
+    """[N, 3], world"""
+    log_scales: np.ndarray
+    """[N, 3], natural log of the standard deviations, world"""
+    quaternions: np.ndarray
+    """[N, 4], w x y z; renderers normalise"""
+    opacity_logits: np.ndarray
+    """[N]"""
+    sh: np.ndarray
+    """[N, (degree + 1) ** 2, 3]; colour = 0.5 + sum of basis times coefficient"""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+
+@dataclass(frozen=True)
+class Quantizer:
+    """Ranges of every channel, fixed once per sequence so that segments stay independent."""
+
+    centre: np.ndarray
+    """Scene centre, world, float64 [3]; also the centre of the UV sphere"""
+    unit: float
+    """Length at which the symmetric-log scale turns from linear to logarithmic, world"""
+    reach: np.ndarray
+    """float64 [3]: positions up to this distance from the centre along each axis have codes"""
+    low: np.ndarray
+    """float64 [A]: value of code 0"""
+    high: np.ndarray
+    """float64 [A]: value of code 255"""
+    sh_degree: int = field(default=0)
+
+    def __post_init__(self) -> None:
+        count = attribute_count(self.sh_degree)
+        if self.low.shape != (count,) or self.high.shape != (count,):
+            raise ValueError(
+                f"SH degree {self.sh_degree} has {count} columns, but the ranges have "
+                f"{self.low.shape} and {self.high.shape}"
+            )
+        if not (self.high > self.low).all() or not (self.reach > 0).all() or not self.unit > 0:
+            raise ValueError("every range of a quantizer must be positive")
+
+    @cached_property
+    def xyz_table(self) -> np.ndarray:
+        """float32 [3, 65536]: position of each code."""
+        edge = np.log1p(self.reach / self.unit)[:, None]  # [3, 1]
+        t = (np.arange(65536) / 32767.5 - 1.0) * edge
+        return (self.centre[:, None] + np.sign(t) * self.unit * np.expm1(np.abs(t))).astype(np.float32)
+
+    @cached_property
+    def attribute_table(self) -> np.ndarray:
+        """float32 [A, 256]: value of each code."""
+        step = (self.high - self.low) / 255
+        return (self.low[:, None] + np.arange(256) * step[:, None]).astype(np.float32)
+
+    def encode(self, gaussians: Gaussians) -> Codes:
+        """Nearest codes; values outside their range saturate."""
+        offset = (gaussians.means.astype(np.float64) - self.centre) / self.unit
+        t = np.sign(offset) * np.log1p(np.abs(offset)) / np.log1p(self.reach / self.unit)
+        xyz = np.clip(np.rint((t + 1) * 32767.5), 0, 65535).astype(np.uint16)
+        values = attribute_values(gaussians).astype(np.float64)
+        scaled = (values - self.low) / (self.high - self.low) * 255
+        return Codes(xyz, np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
+
+    def decode(self, codes: Codes) -> Gaussians:
+        """Exactly the floats that the fit rendered."""
+        xyz = np.stack([self.xyz_table[axis][codes.xyz[:, axis]] for axis in range(3)], axis=1)
+        values = self.attribute_table[np.arange(len(self.low)), codes.attributes]  # [N, A]
+        vector = values[:, ROTATION]
+        square = vector[:, 0] * vector[:, 0] + vector[:, 1] * vector[:, 1] + vector[:, 2] * vector[:, 2]
+        w = np.sqrt(np.maximum(np.float32(0), np.float32(1) - square))
+        return Gaussians(
+            means=xyz,
+            log_scales=np.ascontiguousarray(values[:, SCALE]),
+            quaternions=np.concatenate([w[:, None], vector], axis=1),
+            opacity_logits=np.ascontiguousarray(values[:, OPACITY]),
+            sh=np.ascontiguousarray(values[:, DC.start :]).reshape(len(codes), -1, 3),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "centre": self.centre.tolist(),
+            "unit": self.unit,
+            "reach": self.reach.tolist(),
+            "low": self.low.tolist(),
+            "high": self.high.tolist(),
+            "sh_degree": self.sh_degree,
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Quantizer:
+        arrays = {key: np.asarray(data[key], dtype=np.float64) for key in ("centre", "reach", "low", "high")}
+        return cls(unit=float(data["unit"]), sh_degree=int(data["sh_degree"]), **arrays)
+
+
+def attribute_values(gaussians: Gaussians) -> np.ndarray:
+    """The 8-bit columns as floats, [N, A]; the quaternion is normalised with w >= 0."""
+    q = gaussians.quaternions
+    q = q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-12)
+    vector = np.where(q[:, :1] < 0, -q[:, 1:], q[:, 1:])
+    return np.concatenate(
+        [gaussians.log_scales, vector, gaussians.opacity_logits[:, None], gaussians.sh.reshape(len(gaussians), -1)],
+        axis=1,
+    )

@@ -1,0 +1,1 @@
+"""CPU and GPU Gaussian rasterizers behind one function."""

@@ -1,0 +1,1 @@
+"""Options, flows and the `packuv` command."""

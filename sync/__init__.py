@@ -1,0 +1,1 @@
+"""When each frame was taken: timecodes, AVL index, clock model, frame groups."""

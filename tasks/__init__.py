@@ -1,0 +1,1 @@
+"""The artefact store and one thin Prefect task per stage."""
