@@ -1,0 +1,247 @@
+"""A capture folder: one video per camera, and what belongs to them (docs/capture-folder.md)."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from decimal import Decimal
+from difflib import get_close_matches
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from sync.clock import ClockMode
+from sync.probe import VideoInfo, container_timecodes
+from sync.timecode import Timecodes, parse_rate, read_shared_timecodes, read_timecodes
+
+TIMECODE_SUFFIXES = (".csv", ".txt", ".json")
+SHARED_TIMECODES = "timestamps.csv"
+SOLVE = "solve"
+"""Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
+SIDECAR_SUFFIXES = frozenset(
+    {".aac", ".csv", ".db", ".ini", ".jpeg", ".jpg", ".json", ".log", ".lrv", ".m4a", ".md", ".mp3", ".pdf", ".png"}
+    | {".srt", ".thm", ".toml", ".txt", ".wav", ".xml", ".yaml", ".yml"}
+)
+"""Files beside the videos that are not taken for one. All else is, for FFmpeg reads more than a list can name."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What capture.toml says; every key is optional."""
+
+    name: str | None = None
+    """Name of the sequence; None means the folder's"""
+    fps: Fraction | None = None
+    """Nominal frames per second; SMPTE labels need it"""
+    tags: tuple[str, ...] = ()
+    reference: str | None = None
+    """Camera whose frames are the instants; None leaves it to coverage"""
+    held_out: tuple[str, ...] = ()
+    """Cameras that are calibrated but never fitted, to score the result on"""
+    ignore: tuple[str, ...] = ()
+    """Cameras that are left out altogether"""
+    clock: ClockMode = ClockMode.TRUSTED
+    calibration: str | None = None
+    """Where the calibration is, relative to the capture, or 'solve'; None looks into calibration/"""
+    timecode_column: str | None = None
+    """Time column of the CSV or JSON timecodes, where there are several"""
+
+    @classmethod
+    def read(cls, path: Path) -> CaptureSettings:
+        """Read a capture.toml.
+
+        Raises:
+            ValueError: not TOML, an unknown key or a value of the wrong kind, each by name.
+        """
+        try:
+            # decimals stay exact, so that 29.97 can be told from 29.970000000000001
+            data = tomllib.loads(path.read_text(encoding="utf-8"), parse_float=Decimal)
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path} is no TOML: {error}") from None
+        known = set(cls.__dataclass_fields__)
+        for key in data:
+            if key not in known:
+                raise ValueError(f"{path}: unknown key {key!r}{_suggest(key, known)}; known are {sorted(known)}")
+        return cls(**{key: _checked(path, key, value) for key, value in data.items()})
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The files of one sequence. Cameras are in natural order: cam2 before cam10."""
+
+    folder: Path
+    name: str
+    videos: dict[str, Path]
+    """By camera, without the ignored ones"""
+    timecodes: dict[str, Path]
+    """By camera; cameras without a file of their own are missing, all may share one"""
+    calibration: Path | None
+    """File or folder to import; None means that the rig must be solved"""
+    settings: CaptureSettings = field(default_factory=CaptureSettings)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        return tuple(self.videos)
+
+
+def find_capture(folder: Path) -> Capture:
+    """Find the videos, timecodes, calibration and settings of a capture folder. Opens no video.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        ValueError: not a capture, two files for one camera, or settings that name what is not there.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is no folder; a capture is a folder with videos/<camera>.mp4 in it")
+    path = folder / "capture.toml"
+    settings = CaptureSettings.read(path) if path.is_file() else CaptureSettings()
+    videos = _find_videos(folder)
+    _check_names(path, settings, videos)
+    kept = {camera: video for camera, video in videos.items() if camera not in settings.ignore}
+    if len(kept) < 2:
+        raise ValueError(
+            f"{folder} must hold videos of at least two cameras that are not ignored, but has {list(kept)}"
+        )
+    timecodes = _find_timecodes(folder, videos)
+    return Capture(
+        folder=folder,
+        name=settings.name or folder.resolve().name,
+        videos=kept,
+        timecodes={camera: timecodes[camera] for camera in kept if camera in timecodes},
+        calibration=_find_calibration(folder, settings.calibration),
+        settings=settings,
+    )
+
+
+def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
+    """Timecodes of every camera, numbered by the frames of its video, ready to align.
+
+    They come from the timecode files, or from the containers if no camera has a file.
+
+    Args:
+        infos: what `probe_video` found, by camera.
+
+    Raises:
+        ValueError: some cameras have timecode files and others have not (their times would not be comparable), a file
+            does not parse, or its lines do not fit the frames of the video.
+    """
+    if not capture.timecodes:
+        return {camera: container_timecodes(infos[camera]) for camera in capture.cameras}
+    lacking = [camera for camera in capture.cameras if camera not in capture.timecodes]
+    if lacking:
+        raise ValueError(
+            f"{capture.folder / 'timecodes'} has no file for {lacking}, though it has for others; "
+            "add these, or list the cameras under 'ignore' in capture.toml"
+        )
+    settings = capture.settings
+    paths = set(capture.timecodes.values())
+    if len(paths) == 1:
+        read = read_shared_timecodes(paths.pop(), capture.cameras, rate=settings.fps, column=settings.timecode_column)
+    else:
+        read = {
+            camera: read_timecodes(path, camera=camera, rate=settings.fps, column=settings.timecode_column)
+            for camera, path in capture.timecodes.items()
+        }
+    return {camera: codes.numbered(infos[camera].frame_count, camera=camera) for camera, codes in read.items()}
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key that reads digits as numbers.
+
+    >>> sorted(["cam10", "cam2", "cam1b"], key=natural_key)
+    ['cam1b', 'cam2', 'cam10']
+    """
+    parts = re.findall(r"\d+|\D+", name)
+    return tuple((0, int(part), part) if part[0].isdecimal() else (1, 0, part) for part in parts)
+
+
+def _find_videos(folder: Path) -> dict[str, Path]:
+    inside = folder / "videos"
+    if not inside.is_dir():
+        raise ValueError(f"{folder} is no capture: it must have a folder 'videos' with one file per camera")
+    files = [path for path in inside.iterdir() if path.is_file() and not path.name.startswith(".")]
+    return _by_camera(inside, [path for path in files if path.suffix.lower() not in SIDECAR_SUFFIXES])
+
+
+def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]:
+    inside = folder / "timecodes"
+    files = sorted(inside.iterdir()) if inside.is_dir() else []
+    files = [path for path in files if path.suffix.lower() in TIMECODE_SUFFIXES and not path.name.startswith(".")]
+    shared = [path for path in files if path.name == SHARED_TIMECODES and path.stem not in videos]
+    if shared and len(files) == 1:
+        return dict.fromkeys(videos, shared[0])
+    if shared:
+        others = [path.name for path in files if path not in shared]
+        raise ValueError(f"{inside} must hold {SHARED_TIMECODES} or one file per camera, but has it and {others}")
+    found = _by_camera(inside, files)
+    for camera in found:
+        if camera not in videos:
+            raise ValueError(f"{found[camera]} belongs to no video{_suggest(camera, videos)}; name it like its video")
+    return found
+
+
+def _by_camera(folder: Path, files: Iterable[Path]) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in sorted(files, key=lambda path: (natural_key(path.stem), path.name)):
+        if path.stem in found:
+            raise ValueError(f"{folder} has two files for {path.stem!r}: {found[path.stem].name} and {path.name}")
+        found[path.stem] = path
+    return found
+
+
+def _find_calibration(folder: Path, source: str | None) -> Path | None:
+    """The file or folder to import: the one that is named, else the only kind in calibration/."""
+    if source == SOLVE:
+        return None
+    if source is not None:
+        if not (folder / source).exists():
+            raise ValueError(f"capture.toml: calibration = {source!r}, but {folder / source} is not there")
+        return folder / source
+    found = _calibrations(folder / "calibration")
+    if len(found) > 1:
+        names = [str(path.relative_to(folder)) for path in found]
+        raise ValueError(f"{folder} has several calibrations; choose one in capture.toml: calibration = one of {names}")
+    return found[0] if found else None
+
+
+def _calibrations(inside: Path) -> list[Path]:
+    models = [inside, inside / "sparse" / "0", inside / "sparse", inside / "0"]
+    found = [place for place in models if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))]
+    found += [inside / name for name in ("transforms.json", "poses_bounds.npy") if (inside / name).is_file()]
+    if all((inside / name).is_file() for name in ("intri.yml", "extri.yml")):
+        found.append(inside)
+    return found + (sorted(inside.glob("*.toml")) if inside.is_dir() else [])
+
+
+def _check_names(path: Path, settings: CaptureSettings, videos: Mapping[str, Path]) -> None:
+    for key in ("reference", "held_out", "ignore"):
+        value = getattr(settings, key)
+        for camera in (value,) if isinstance(value, str) else value or ():
+            if camera not in videos:
+                raise ValueError(f"{path}: {key} names {camera!r}, which has no video{_suggest(camera, videos)}")
+    both = [camera for camera in (settings.reference, *settings.held_out) if camera in settings.ignore]
+    if both:
+        raise ValueError(f"{path}: {both} cannot be ignored and used as reference or held out")
+
+
+def _checked(path: Path, key: str, value: Any) -> Any:
+    """The value of a key in the form that `CaptureSettings` holds."""
+    try:
+        if key == "fps":
+            return parse_rate(value)
+        if key == "clock":
+            return ClockMode(value)
+    except ValueError as error:
+        raise ValueError(f"{path}: {key}: {error}; clocks are {[str(mode) for mode in ClockMode]}") from None
+    many = key in ("tags", "held_out", "ignore")
+    texts = value if many else [value]
+    if not isinstance(texts, list) or not all(isinstance(text, str) and text for text in texts):
+        raise ValueError(f"{path}: {key} must be {'a list of texts' if many else 'a text'}, but is {value!r}")
+    return tuple(texts) if many else value
+
+
+def _suggest(name: str, known: Iterable[str]) -> str:
+    close = get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""

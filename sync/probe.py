@@ -1,0 +1,185 @@
+"""What a video file holds, from its packets alone: nothing is decoded.
+
+Headers lie about frame counts and rates (AVI halves, cut MP4 hides frames), and the frame-exact decoder needs files
+whose packets carry true presentation times. Whatever is not such a file is refused here with the command that makes
+it one (measured: decoders return wrong pictures from MPEG-TS, cut MP4 and AVI with B-frames).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+from sync.timecode import NANOSECONDS, Timecodes, label_to_frame, labels_to_ns, ticks_to_ns
+
+STREAM_FORMATS = frozenset({"mpegts", "mpeg", "h264", "hevc", "vvc", "m4v", "mpegvideo", "mjpeg", "obu", "dv"})
+"""Containers without a reliable time per frame: transport and program streams, bare codec streams."""
+PICTURE_FORMATS = frozenset({"image2", "tty", "ico"})
+LONGEST_LOSS_S = Fraction(1, 2)
+"""A file may end this much before its header says: the last frame's own duration is often wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class VideoInfo:
+    """One video stream."""
+
+    width: int
+    """Pixels, as stored"""
+    height: int
+    codec: str
+    rate: Fraction
+    """Nominal frames per second"""
+    frame_count: int
+    """Frames that decode, counted from packets"""
+    pts_ns: np.ndarray
+    """int64 [frame_count]: presentation times in the container, strictly increasing"""
+    duration_ns: int
+    """From the first frame to the end of the last"""
+    size_bytes: int
+    start_label: str | None = None
+    """SMPTE label of the first frame, where the container has one"""
+
+    def __post_init__(self) -> None:
+        if self.pts_ns.shape != (self.frame_count,) or self.frame_count < 1:
+            raise ValueError(f"{self.frame_count} frames need as many times, but there are {self.pts_ns.shape}")
+
+
+def probe_video(path: Path) -> VideoInfo:
+    """Count the frames of a video and read their times.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not a video, cut short, damaged, or in a form from which frames cannot be taken exactly; the
+            message says what to do.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file; a capture needs one video per camera")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path} is empty; copy the recording again")
+    try:
+        with av.open(str(path)) as container:
+            return _probe(path, container)
+    except av.error.FFmpegError as error:
+        raise ValueError(f"{path} is no video that FFmpeg can read, or its index is lost: {error.strerror}") from None
+
+
+def container_timecodes(info: VideoInfo) -> Timecodes:
+    """Timecodes from the container: presentation times, after the SMPTE start label where there is one.
+
+    Without a label the times begin where the container's do, which is 0 for most: they align cameras only if all
+    recordings were started by one trigger or cut from one timeline.
+    """
+    times = info.pts_ns
+    if info.start_label is not None:
+        times = labels_to_ns([info.start_label], info.rate) + (times - times[0])
+    return Timecodes(times, np.arange(len(times), dtype=np.int64))
+
+
+def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
+    stream = container.streams.best("video")
+    name = container.format.name
+    if not isinstance(stream, av.VideoStream) or name in PICTURE_FORMATS or name.endswith("_pipe"):
+        raise ValueError(f"{path} holds no video ({name})")
+    if name in STREAM_FORMATS:
+        raise ValueError(f"{path} is a stream ({name}) in which frames cannot be sought exactly; {_remedy(path, name)}")
+    packets = [packet for packet in container.demux(stream) if packet.size]
+    _check_whole(path, container, stream, packets)
+    pts = np.sort(np.array(_presentation_times(path, name, stream, packets), dtype=np.int64))
+    assert stream.time_base is not None
+    pts_ns = ticks_to_ns(pts, stream.time_base)
+    if (np.diff(pts_ns) <= 0).any():
+        raise ValueError(f"{path} has frames with one and the same time; {_reencode(path)}")
+    rate = _rate(path, stream, pts_ns)
+    gap = int(np.median(np.diff(pts_ns))) if len(pts_ns) > 1 else int(NANOSECONDS / rate)
+    return VideoInfo(
+        width=stream.width,
+        height=stream.height,
+        codec=stream.codec_context.name,
+        rate=rate,
+        frame_count=len(pts_ns),
+        pts_ns=pts_ns,
+        duration_ns=int(pts_ns[-1] - pts_ns[0]) + gap,
+        size_bytes=path.stat().st_size,
+        start_label=_start_label(container, stream, rate),
+    )
+
+
+def _check_whole(
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: list[av.Packet]
+) -> None:
+    if not packets:
+        raise ValueError(f"{path} holds no frames; copy the recording again")
+    broken = next((number for number, packet in enumerate(packets) if packet.is_corrupt), None)
+    if broken is not None:
+        raise ValueError(f"{path} is cut short or damaged at frame {broken}; copy the recording again")
+    # only MP4 and MOV count samples exactly in their header
+    if container.format.name.startswith("mov") and stream.frames > len(packets):
+        raise ValueError(f"{path} is cut short: {len(packets)} of {stream.frames} frames; copy the recording again")
+    declared, found = _declared_end_s(stream), _found_end_s(stream, packets)
+    if declared is not None and declared - found > LONGEST_LOSS_S:
+        raise ValueError(
+            f"{path} is cut short: {float(found):.2f} of {float(declared):.2f} s; copy the recording again"
+        )
+
+
+def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: list[av.Packet]) -> list[int]:
+    hidden = sum(packet.is_discard for packet in packets)
+    if hidden:
+        raise ValueError(
+            f"{path} was cut without re-encoding: an edit list hides {hidden} of its {len(packets)} frames, and "
+            f"decoders disagree about the others; {_reencode(path)}"
+        )
+    if name == "avi" and stream.codec_context.has_b_frames:
+        raise ValueError(f"{path} is an AVI with B-frames, which has no presentation times; {_reencode(path)}")
+    times = [packet.pts for packet in packets if packet.pts is not None]
+    if len(times) < len(packets):
+        raise ValueError(f"{path} has {len(packets) - len(times)} frames without a time; {_reencode(path)}")
+    return times
+
+
+def _remedy(path: Path, name: str) -> str:
+    """How to get a file with a time per frame. Only MPEG-TS survives copying; others lose or hide frames."""
+    if name == "mpegts":
+        return f"remux it: ffmpeg -i {path.name} -map 0:v:0 -c copy {path.stem}.mp4"
+    return _reencode(path) if name == "mpeg" else _reencode(path).replace("-i ", "-framerate 30 -i ", 1)
+
+
+def _reencode(path: Path) -> str:
+    return f"re-encode it: ffmpeg -i {path.name} -map 0:v:0 -c:v libx264 -crf 12 {path.stem}_exact.mp4"
+
+
+def _declared_end_s(stream: av.VideoStream) -> Fraction | None:
+    """End of the stream by Matroska's DURATION tag, which survives when the file is cut short."""
+    parts = stream.metadata.get("DURATION", "").split(":")
+    if len(parts) != 3:
+        return None
+    return sum((Fraction(part) * 60**power for power, part in zip((2, 1, 0), parts, strict=True)), Fraction(0))
+
+
+def _found_end_s(stream: av.VideoStream, packets: list[av.Packet]) -> Fraction:
+    assert stream.time_base is not None
+    last = max((packet.pts or 0) + (packet.duration or 0) for packet in packets)
+    return last * stream.time_base
+
+
+def _rate(path: Path, stream: av.VideoStream, pts_ns: np.ndarray) -> Fraction:
+    """Of the container's rates the one that fits the median gap; else the rate measured."""
+    named = [Fraction(rate) for rate in (stream.guessed_rate, stream.average_rate) if rate]
+    if len(pts_ns) < 2:
+        return named[0] if named else Fraction(30)
+    measured = Fraction(NANOSECONDS, int(np.median(np.diff(pts_ns))))
+    fits = [rate for rate in named if abs(rate / measured - 1) < Fraction(1, 10)]
+    return fits[0] if fits else measured.limit_denominator(1001)
+
+
+def _start_label(container: av.container.InputContainer, stream: av.VideoStream, rate: Fraction) -> str | None:
+    tracks = [stream.metadata, container.metadata, *(other.metadata for other in container.streams)]
+    label = next((data["timecode"] for data in tracks if "timecode" in data), None)
+    try:
+        return label if label is not None and label_to_frame(label, rate) >= 0 else None
+    except ValueError:
+        return None  # the track counts at another rate than the frames; a wrong time is worse than none

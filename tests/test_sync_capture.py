@@ -1,0 +1,200 @@
+"""Capture folders: what is found in them, and what is said about those that do not work."""
+
+import doctest
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sync.capture
+from sync.capture import CaptureSettings, find_capture, load_timecodes
+from sync.clock import ClockMode
+from sync.probe import VideoInfo
+
+
+def make_capture(folder: Path, *files: str, settings: str | None = None) -> Path:
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_bytes(b"content")
+    folder.mkdir(exist_ok=True)
+    if settings is not None:
+        (folder / "capture.toml").write_text(settings)
+    return folder
+
+
+def make_info(frames: int) -> VideoInfo:
+    times = np.arange(frames, dtype=np.int64) * 40_000_000
+    return VideoInfo(64, 48, "h264", Fraction(25), frames, times, frames * 40_000_000, 1000)
+
+
+VIDEOS = ("videos/cam1.mp4", "videos/cam2.mkv", "videos/cam10.mov")
+
+
+def test_a_bare_folder_of_videos_is_a_capture(tmp_path: Path) -> None:
+    capture = find_capture(make_capture(tmp_path / "dance", *VIDEOS))
+    assert capture.name == "dance"
+    assert capture.cameras == ("cam1", "cam2", "cam10")
+    assert capture.timecodes == {}
+    assert capture.calibration is None
+    assert capture.settings == CaptureSettings()
+
+
+def test_files_that_are_no_videos_are_passed_over(tmp_path: Path) -> None:
+    others = ("videos/.DS_Store", "videos/notes.txt", "videos/cam1.JPG", "videos/old/cam3.mp4", "masks/cam1/0.png")
+    assert find_capture(make_capture(tmp_path, *VIDEOS, *others)).cameras == ("cam1", "cam2", "cam10")
+
+
+def test_settings_are_read(tmp_path: Path) -> None:
+    text = """
+        name = "dance"
+        fps = 29.97
+        tags = ["studio", "fast"]
+        reference = "cam2"
+        held_out = ["cam10"]
+        ignore = ["cam1"]
+        clock = "triggered"
+        calibration = "solve"
+        timecode_column = "pts_ns"
+    """
+    files = (*VIDEOS, "videos/cam3.mp4", "calibration/transforms.json", "timecodes/cam1.txt", "timecodes/cam2.csv")
+    capture = find_capture(make_capture(tmp_path, *files, settings=text))
+    assert capture.name == "dance"
+    assert capture.cameras == ("cam2", "cam3", "cam10")
+    assert set(capture.timecodes) == {"cam2"}
+    assert capture.calibration is None
+    settings = capture.settings
+    assert settings.fps == Fraction(30000, 1001)
+    assert settings.tags == ("studio", "fast")
+    assert (settings.reference, settings.held_out, settings.ignore) == ("cam2", ("cam10",), ("cam1",))
+    assert settings.clock is ClockMode.TRIGGERED
+    assert settings.timecode_column == "pts_ns"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("heldout = []", "unknown key 'heldout'; did you mean 'held_out'"),
+        ("colour = 1", "unknown key 'colour'; known are"),
+        ("name =", "is no TOML"),
+        ("fps = 'fast'", "fps: a frame rate is a number"),
+        ("fps = 0", "fps: a frame rate lies between"),
+        ("clock = 'sundial'", "clock: .*sundial"),
+        ("name = 3", "name must be a text, but is 3"),
+        ("tags = 'a'", "tags must be a list of texts"),
+        ("ignore = [1]", "ignore must be a list of texts"),
+        ("reference = 'cam3'", "reference names 'cam3', which has no video; did you mean 'cam"),
+        ("held_out = ['left']", "held_out names 'left', which has no video$"),
+        ("ignore = ['cam1']\nreference = 'cam1'", r"\['cam1'\] cannot be ignored"),
+        ("ignore = ['cam1', 'cam2']", "at least two cameras"),
+        ("calibration = 'rig.json'", "calibration = 'rig.json', but .* is not there"),
+    ],
+)
+def test_bad_settings_are_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        find_capture(make_capture(tmp_path, *VIDEOS, settings=text))
+
+
+def test_folders_that_are_no_capture(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="none is no folder"):
+        find_capture(tmp_path / "none")
+    with pytest.raises(ValueError, match="must have a folder 'videos'"):
+        find_capture(tmp_path)
+    with pytest.raises(ValueError, match="at least two cameras"):
+        find_capture(make_capture(tmp_path, "videos/cam1.mp4"))
+    with pytest.raises(ValueError, match=r"two files for 'cam1': cam1\.mkv and cam1\.mp4"):
+        find_capture(make_capture(tmp_path, "videos/cam1.mkv"))
+
+
+# Timecodes
+
+
+def test_timecodes_are_found_by_camera_or_shared(tmp_path: Path) -> None:
+    own = make_capture(tmp_path / "own", *VIDEOS, *(f"timecodes/cam{n}.txt" for n in (1, 2, 10)), "timecodes/.hidden")
+    assert {camera: path.name for camera, path in find_capture(own).timecodes.items()} == {
+        "cam1": "cam1.txt", "cam2": "cam2.txt", "cam10": "cam10.txt"
+    }  # fmt: skip
+    shared = make_capture(tmp_path / "shared", *VIDEOS, "timecodes/timestamps.csv")
+    assert set(find_capture(shared).timecodes.values()) == {shared / "timecodes" / "timestamps.csv"}
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (("timecodes/cam01.txt",), r"cam01\.txt belongs to no video; did you mean 'cam1'"),
+        (("timecodes/cam1.txt", "timecodes/cam1.csv"), r"two files for 'cam1'"),
+        (("timecodes/timestamps.csv", "timecodes/cam1.csv"), r"timestamps\.csv or one file per camera"),
+    ],
+)
+def test_timecodes_that_belong_nowhere(tmp_path: Path, files: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        find_capture(make_capture(tmp_path, *VIDEOS, *files))
+
+
+def test_timecodes_are_numbered_by_the_frames_of_the_video(tmp_path: Path) -> None:
+    folder = make_capture(tmp_path, "videos/a.mp4", "videos/b.mp4", "timecodes/a.txt")
+    (folder / "timecodes" / "a.txt").write_text(
+        "frame_1734551081928174_000000000070\nframe_1734551081962493_000000000072\n"
+    )
+    (folder / "timecodes" / "b.csv").write_text("frame,time_us\n4,1734551081928174\n5,1734551081962493\n")
+    capture = find_capture(folder)
+    found = load_timecodes(capture, {"a": make_info(3), "b": make_info(2)})
+    assert found["a"].indices.tolist() == [0, 2]
+    assert found["b"].indices.tolist() == [0, 1]
+    assert np.array_equal(found["a"].times_ns, found["b"].times_ns)
+    with pytest.raises(ValueError, match="camera 'b' has 7 frames in its video, but 2 timecodes"):
+        load_timecodes(capture, {"a": make_info(3), "b": make_info(7)})
+
+
+def test_shared_timecodes_are_loaded(tmp_path: Path) -> None:
+    folder = make_capture(tmp_path, "videos/cam_0.mp4", "videos/cam_1.mp4")
+    (folder / "timecodes").mkdir()
+    (folder / "timecodes" / "timestamps.csv").write_text("cam_id,frame_time\n0,1.5\n1,1.51\n1,1.6\n0,1.61\n")
+    found = load_timecodes(find_capture(folder), {"cam_0": make_info(2), "cam_1": make_info(2)})
+    assert found["cam_1"].times_ns.tolist() == [1510000000, 1600000000]
+
+
+def test_without_timecodes_the_containers_serve(tmp_path: Path) -> None:
+    capture = find_capture(make_capture(tmp_path, "videos/a.mp4", "videos/b.mp4"))
+    found = load_timecodes(capture, {"a": make_info(3), "b": make_info(2)})
+    assert found["a"].times_ns.tolist() == [0, 40_000_000, 80_000_000]
+
+
+def test_timecodes_for_some_cameras_only_are_refused(tmp_path: Path) -> None:
+    capture = find_capture(make_capture(tmp_path, "videos/a.mp4", "videos/b.mp4", "timecodes/a.txt"))
+    with pytest.raises(ValueError, match=r"no file for \['b'\]"):
+        load_timecodes(capture, {"a": make_info(3), "b": make_info(2)})
+
+
+# Calibration
+
+
+@pytest.mark.parametrize(
+    ("files", "found"),
+    [
+        (("calibration/cameras.txt", "calibration/images.txt"), "calibration"),
+        (("calibration/cameras.bin", "calibration/cameras.txt"), "calibration"),
+        (("calibration/sparse/0/cameras.bin",), "calibration/sparse/0"),
+        (("calibration/transforms.json", "calibration/readme.md"), "calibration/transforms.json"),
+        (("calibration/poses_bounds.npy",), "calibration/poses_bounds.npy"),
+        (("calibration/intri.yml", "calibration/extri.yml"), "calibration"),
+        (("calibration/camera_array.toml",), "calibration/camera_array.toml"),
+        (("calibration/intri.yml",), None),
+    ],
+)
+def test_calibrations_are_found(tmp_path: Path, files: tuple[str, ...], found: str | None) -> None:
+    folder = make_capture(tmp_path, *VIDEOS, *files)
+    assert find_capture(folder).calibration == (None if found is None else folder / found)
+
+
+def test_of_several_calibrations_one_must_be_named(tmp_path: Path) -> None:
+    folder = make_capture(tmp_path, *VIDEOS, "calibration/a.toml", "calibration/transforms.json")
+    with pytest.raises(ValueError, match=r"one of \['calibration/transforms.json', 'calibration/a.toml'\]"):
+        find_capture(folder)
+    make_capture(folder, settings="calibration = 'calibration/a.toml'")
+    assert find_capture(folder).calibration == folder / "calibration" / "a.toml"
+
+
+def test_docstring_examples_hold() -> None:
+    assert doctest.testmod(sync.capture).failed == 0
+    assert doctest.testmod(sync.capture).attempted > 0
