@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numba import njit, prange
 
 SCALE = slice(0, 3)
 """Columns of `Codes.attributes`: natural log of the three standard deviations."""
@@ -111,8 +112,7 @@ class Quantizer:
     @cached_property
     def xyz_table(self) -> np.ndarray:
         """float32 [3, 65536]: position of each code."""
-        edge = np.log1p(self.reach / self.unit)[:, None]  # [3, 1]
-        t = (np.arange(65536) / 32767.5 - 1.0) * edge
+        t = (np.arange(65536) / 32767.5 - 1.0) * self._edge[:, None]
         return (self.centre[:, None] + np.sign(t) * self.unit * np.expm1(np.abs(t))).astype(np.float32)
 
     @cached_property
@@ -122,28 +122,35 @@ class Quantizer:
         return (self.low[:, None] + np.arange(256) * step[:, None]).astype(np.float32)
 
     def encode(self, gaussians: Gaussians) -> Codes:
-        """Nearest codes; values outside their range saturate."""
-        offset = (gaussians.means.astype(np.float64) - self.centre) / self.unit
-        t = np.sign(offset) * np.log1p(np.abs(offset)) / np.log1p(self.reach / self.unit)
-        xyz = np.clip(np.rint((t + 1) * 32767.5), 0, 65535).astype(np.uint16)
-        values = attribute_values(gaussians).astype(np.float64)
-        scaled = (values - self.low) / (self.high - self.low) * 255
-        return Codes(xyz, np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
+        """Nearest codes; values outside their range saturate, see `saturation`."""
+        count, columns = len(gaussians), len(self.low)
+        xyz, attributes = np.empty((count, 3), np.uint16), np.empty((count, columns), np.uint8)
+        _encode(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits,
+                gaussians.sh.reshape(count, -1), self.centre, self.unit, self._edge, self.low,
+                255 / (self.high - self.low), xyz, attributes)  # fmt: skip
+        return Codes(xyz, attributes)
 
     def decode(self, codes: Codes) -> Gaussians:
         """Exactly the floats that the fit rendered."""
-        xyz = np.stack([self.xyz_table[axis][codes.xyz[:, axis]] for axis in range(3)], axis=1)
-        values = self.attribute_table[np.arange(len(self.low)), codes.attributes]  # [N, A]
-        vector = values[:, ROTATION]
-        square = vector[:, 0] * vector[:, 0] + vector[:, 1] * vector[:, 1] + vector[:, 2] * vector[:, 2]
-        w = np.sqrt(np.maximum(np.float32(0), np.float32(1) - square))
-        return Gaussians(
-            means=xyz,
-            log_scales=np.ascontiguousarray(values[:, SCALE]),
-            quaternions=np.concatenate([w[:, None], vector], axis=1),
-            opacity_logits=np.ascontiguousarray(values[:, OPACITY]),
-            sh=np.ascontiguousarray(values[:, DC.start :]).reshape(len(codes), -1, 3),
-        )
+        if codes.attributes.shape[1] != len(self.low):
+            raise ValueError(f"codes have {codes.attributes.shape[1]} columns, the quantizer {len(self.low)}")
+        count, coefficients = len(codes), (self.sh_degree + 1) ** 2
+        shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, 3 * coefficients)]
+        out = [np.empty(shape, np.float32) for shape in shapes]
+        _decode(codes.xyz, codes.attributes, self.xyz_table, self.attribute_table, *out)
+        return Gaussians(*out[:4], sh=out[4].reshape(count, coefficients, 3))
+
+    def saturation(self, gaussians: Gaussians) -> int:
+        """Number of values that lie more than half a step outside their range."""
+        offset = np.abs(gaussians.means - self.centre) > self.reach * (1 + 1e-4)
+        values, half = attribute_values(gaussians), (self.high - self.low) / 510
+        outside = (values < self.low - half) | (values > self.high + half)
+        return int(offset.sum() + outside.sum())
+
+    @property
+    def _edge(self) -> np.ndarray:
+        """float64 [3]: the symmetric logarithm at the end of each axis."""
+        return np.log1p(self.reach / self.unit)
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -170,3 +177,46 @@ def attribute_values(gaussians: Gaussians) -> np.ndarray:
         [gaussians.log_scales, vector, gaussians.opacity_logits[:, None], gaussians.sh.reshape(len(gaussians), -1)],
         axis=1,
     )
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def _encode(means, log_scales, quaternions, opacity_logits, sh, centre, unit, edge, low, per_step, xyz, attributes):
+    for row in prange(len(means)):
+        i = np.int64(row)
+        for axis in range(3):
+            offset = (np.float64(means[i, axis]) - centre[axis]) / unit
+            t = np.copysign(np.log1p(abs(offset)), offset) / edge[axis]
+            xyz[i, axis] = min(max(np.rint((t + 1) * 32767.5), 0.0), 65535.0)
+            attributes[i, axis] = _step(log_scales[i, axis], low[axis], per_step[axis])
+        w, x = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1])
+        y, z = np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
+        length = max(np.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+        sign = (-1.0 if w < 0 else 1.0) / length
+        attributes[i, 3] = _step(x * sign, low[3], per_step[3])
+        attributes[i, 4] = _step(y * sign, low[4], per_step[4])
+        attributes[i, 5] = _step(z * sign, low[5], per_step[5])
+        attributes[i, 6] = _step(opacity_logits[i], low[6], per_step[6])
+        for k in range(sh.shape[1]):
+            attributes[i, 7 + k] = _step(sh[i, k], low[7 + k], per_step[7 + k])
+
+
+@njit(cache=True, error_model="numpy")
+def _step(value, low, per_step):
+    return np.uint8(min(max(np.rint((np.float64(value) - low) * per_step), 0.0), 255.0))
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def _decode(xyz, attributes, xyz_table, table, means, log_scales, quaternions, opacity_logits, sh):
+    for row in prange(len(xyz)):
+        i = np.int64(row)
+        for axis in range(3):
+            means[i, axis] = xyz_table[axis, xyz[i, axis]]
+            log_scales[i, axis] = table[axis, attributes[i, axis]]
+        x, y, z = table[3, attributes[i, 3]], table[4, attributes[i, 4]], table[5, attributes[i, 5]]
+        # In float64, so that no contraction of multiply and add can change the rounded result.
+        rest = 1.0 - (np.float64(x) * x + np.float64(y) * y + np.float64(z) * z)
+        quaternions[i, 0] = np.float32(np.sqrt(max(rest, 0.0)))
+        quaternions[i, 1], quaternions[i, 2], quaternions[i, 3] = x, y, z
+        opacity_logits[i] = table[6, attributes[i, 6]]
+        for k in range(sh.shape[1]):
+            sh[i, k] = table[7 + k, attributes[i, 7 + k]]

@@ -1,1 +1,65 @@
-"""CPU and GPU Gaussian rasterizers behind one function."""
+"""CPU and GPU Gaussian rasterizers behind one pair of functions.
+
+`render` draws Gaussians with one camera, `gradients` carries derivatives of the picture back to them. Where the
+Gaussians live decides who does the work: numpy arrays go to the CPU rasterizer, CUDA tensors to gsplat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from packuv.camera import PinholeCamera
+from packuv.quantize import Gaussians
+from packuv.raster import cpu
+from packuv.raster.cpu import Gradients, RasterOptions, Rendering, Workspace, tile_shape
+
+__all__ = ["Gradients", "RasterOptions", "Rendering", "Workspace", "gradients", "render", "tile_shape"]
+
+
+def render(
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    *,
+    options: RasterOptions,
+    sh_degree: int | None = None,
+    background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    tiles: np.ndarray | None = None,
+    weights: bool = False,
+    workspace: Workspace | None = None,
+) -> Any:
+    """Picture of N Gaussians: `cpu.Rendering`, or `gsplat.TensorRendering` with the same fields on a GPU.
+
+    `tiles`, bool as `tile_shape(camera)`, names the tiles to draw; the rest shows background. `weights` asks for
+    the blending weight of each Gaussian. `workspace` holds memory between calls, CPU only. Raises ValueError if the
+    Gaussians are tensors that are not on a GPU, or if shapes do not fit.
+    """
+    if isinstance(gaussians.means, np.ndarray):
+        return cpu.forward(gaussians, camera, options=options, sh_degree=sh_degree, background=background, tiles=tiles,
+                           weights=weights, workspace=workspace)  # fmt: skip
+    if gaussians.means.device.type != "cuda":
+        raise ValueError("Gaussians on the CPU must be numpy arrays, but are tensors; take tensor.detach().numpy()")
+    return _gsplat().forward(gaussians, camera, options=options, sh_degree=sh_degree, background=background,
+                             tiles=tiles, weights=weights)  # fmt: skip
+
+
+def gradients(
+    rendering: Any, d_colour: Any, d_depth: Any = None, d_alpha: Any = None, *, rows: Any = None
+) -> Gradients:
+    """Gradients of a scalar by the Gaussians, from its derivatives by the pictures of `rendering`.
+
+    d_colour [3, H, W]; d_depth and d_alpha [H, W], None for zero; `rows`, bool [N], the Gaussians that may change, the
+    others get zeros. Arrays or tensors, as the rendering holds.
+    """
+    if isinstance(rendering, Rendering):
+        return cpu.backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
+    return _gsplat().backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
+
+
+def _gsplat() -> Any:
+    """The CUDA backend, imported late: it needs torch, which takes seconds to load."""
+    from packuv.raster import gsplat
+
+    return gsplat

@@ -1,0 +1,342 @@
+"""Fit Gaussians to the pictures of many cameras: the keyframe chain and the frames of each segment (paper §4.2).
+
+    fit_first     pictures of one instant -> the first keyframe, and the quantizer of the whole sequence
+    fit_next      a keyframe and the pictures of a later instant -> the next keyframe; what did not change keeps its codes
+    fit_segment   a keyframe and the instants after it -> a `Segment`; frame by frame, from each to the next
+
+From the moment the quantizer is fixed every iteration renders decoded codes and the gradient passes straight through
+to float32 masters (low-precision optimisation), so the codes that are stored are the ones that were fitted.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from packuv.density import opacity, prune
+from packuv.files import write_json, write_npz
+from packuv.frames import Views
+from packuv.labels import active_tiles, dynamic_labels
+from packuv.lift import lift_motion
+from packuv.model import ATTRIBUTES, Model, canonical, rows_of
+from packuv.motion import MotionCache
+from packuv.quantize import OPACITY, OPACITY_RANGE, Codes, Gaussians, Quantizer, attribute_values
+from packuv.segment import Segment
+from packuv.solver import FitOptions, Progress, Shot, Solver, Ticks, halved
+from packuv.start import Bounds, Points, find_bounds, first_gaussians, hull_points, neighbour_distance, round_gaussians
+
+VERSION = 1
+"""Raised with every change that alters what a fit returns"""
+
+DEAD_CODE = 1
+"""Opacity codes up to this one decode below 1/255, which no renderer draws"""
+
+
+@dataclass(frozen=True)
+class KeyState:
+    """A fitted keyframe, from which segments and the next keyframe start."""
+
+    instant: int
+    gaussians: Gaussians
+    """float32 masters, not rounded to codes"""
+    quantizer: Quantizer
+    bounds: Bounds
+    figures: Mapping[str, float]
+    """What the fit measured: seconds, loss, Gaussians"""
+
+    def save(self, folder: Path) -> None:
+        """Write state.npz and key.json."""
+        write_npz(folder / "state.npz", {name: getattr(self.gaussians, name) for name in ATTRIBUTES})
+        bounds = {"centre": self.bounds.centre.tolist(), "radius": self.bounds.radius, "near": self.bounds.near}
+        write_json(folder / "key.json", {"instant": self.instant, "quantizer": self.quantizer.to_json(),
+                                         "bounds": bounds, "figures": dict(self.figures)})  # fmt: skip
+
+    @classmethod
+    def load(cls, folder: Path) -> KeyState:
+        data = json.loads((folder / "key.json").read_text())
+        bounds = Bounds(np.array(data["bounds"]["centre"]), data["bounds"]["radius"], data["bounds"]["near"])
+        with np.load(folder / "state.npz") as arrays:
+            gaussians = Gaussians(*(arrays[name] for name in ATTRIBUTES))
+        return cls(data["instant"], gaussians, Quantizer.from_json(data["quantizer"]), bounds, data["figures"])
+
+
+def fit_first(
+    views: Views, instant: int, *, points: Points | None, options: FitOptions, progress: Progress | None = None
+) -> KeyState:
+    """Fit the first keyframe from sparse points and random Gaussians.
+
+    `views` must hold the cameras to fit and no others. Raises ValueError if fewer than two have a picture.
+    """
+    started = time.monotonic()
+    shots = _shots(views, instant)
+    bounds = find_bounds(views.cameras, near_share=options.near_share)
+    model = Model(first_gaussians([s.camera for s in shots], [s.target for s in shots], bounds=bounds, points=points,
+                                  options=options.start, sh_degree=options.sh_degree, seed=options.seed))  # fmt: skip
+    solver = Solver(model, bounds, options, np.random.default_rng([options.seed, instant, 0]))
+    ticks = Ticks(progress, options.iterations)
+    coarse = round(options.iterations * options.coarse_share)
+    floating = max(coarse, round(options.iterations * options.float_share))
+    solver.run([halved(shot) for shot in shots], coarse, of=options.iterations, dense=True, ticks=ticks)
+    solver.run(shots, floating - coarse, of=options.iterations, dense=True, ticks=ticks)
+    solver.keep(prune(model, solver.gradient, bounds=bounds, options=options.density, uv=options.uv))
+    model.gaussians = canonical(model.gaussians)
+    model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
+    solver.fix(choose_quantizer(model.gaussians, bounds, options.sh_degree))
+    loss = solver.run(shots, options.iterations - floating, of=options.iterations, ticks=ticks)
+    return KeyState(instant, model.gaussians, solver.known_quantizer, bounds, _figures(started, loss, solver))
+
+
+def fit_next(
+    previous: KeyState,
+    views: Views,
+    instant: int,
+    *,
+    masks: Sequence[np.ndarray | None],
+    options: FitOptions,
+    progress: Progress | None = None,
+) -> KeyState:
+    """Fit a later keyframe from the one before it.
+
+    `masks` tell, per camera of `views`, what differs between the two instants, bool [H, W] (None: unknown, the whole
+    picture may). Gaussians that touch no mask keep every code. New ones are born where the masks meet.
+    """
+    started = time.monotonic()
+    bounds, quantizer = previous.bounds, previous.quantizer
+    rng = np.random.default_rng([options.seed, instant, 1])
+    model = Model(previous.gaussians)
+    solver = Solver(model, bounds, options, rng)
+    solver.fix(quantizer)
+    if not any(mask is None or mask.any() for mask in masks):
+        return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, 0.0, solver))
+    shots = _shots(views, instant, masks)
+    moving = _labels(model.gaussians, quantizer, views, masks, bounds, options)
+    solver.free(moving)
+    born = _hull_gaussians(views, instant, masks, bounds, options, rng)
+    room = max(0, options.density.cap - len(model))
+    solver.append(rows_of(born, slice(0, room)))
+    shots = _tiled(shots, masks, solver, views)
+    loss = solver.run(shots, options.key_iterations, of=options.key_iterations, dense=True,
+                      ticks=Ticks(progress, options.key_iterations))  # fmt: skip
+    solver.keep(~solver.rows | prune(model, solver.gradient, bounds=bounds, options=options.density, uv=options.uv))
+    return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, loss, solver))
+
+
+def fit_segment(
+    key: KeyState,
+    views: Views,
+    instants: range,
+    *,
+    motion: MotionCache,
+    options: FitOptions,
+    scratch: Path,
+    progress: Progress | None = None,
+) -> tuple[Segment, list[dict[str, float]]]:
+    """Fit the frames of one segment; `instants` starts with the keyframe's own. Returns the segment and figures per frame.
+
+    After every frame the state goes to `scratch`, from which a later call continues with the same result.
+    """
+    if instants.start != key.instant:
+        raise ValueError(f"a segment starts at its keyframe, instant {key.instant}, not at {instants.start}")
+    track = Track.resume(key, options, scratch)
+    ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
+    for instant in instants[1 + len(track.frames) :]:
+        masks = [motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras]
+        flows = [motion.flow(motion.names.index(camera.name), instant) for camera in views.cameras]
+        track.add(_fit_frame(track.model, key, views, instant, masks, flows, options))
+        track.checkpoint()
+        ticks.advance()
+    return track.segment(), track.figures
+
+
+def _fit_frame(
+    model: Model,
+    key: KeyState,
+    views: Views,
+    instant: int,
+    masks: Sequence[np.ndarray | None],
+    flows: Sequence[np.ndarray | None],
+    options: FitOptions,
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Carry the model on to one instant; returns the rows that it changed, bool [N], and figures."""
+    started = time.monotonic()
+    rows = np.zeros(len(model), bool)
+    if not any(mask is not None and mask.any() for mask in masks):
+        return rows, {"instant": instant, "seconds": time.monotonic() - started, "iterations": 0, "dynamic": 0}
+    rng = np.random.default_rng([options.seed, instant, 2])
+    solver = Solver(model, key.bounds, options, rng)
+    solver.fix(key.quantizer)
+    rows = _labels(model.gaussians, key.quantizer, views, masks, key.bounds, options)
+    model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, flows, masks,
+                                               near=key.bounds.near, options=options.lift)  # fmt: skip
+    spare = opacity(model.gaussians) <= options.density.min_opacity
+    model.forget_moments(np.flatnonzero(rows | spare))
+    solver.free(rows | spare)
+    shots = _tiled(_shots(views, instant, masks), masks, solver, views)
+    loss, count = solver.settle(shots, options.frame_iterations)
+    changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
+    figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count, "loss": loss,
+               "dynamic": int(changed.sum()), "tiles": float(np.mean([np.mean(s.tiles) for s in shots]))}  # fmt: skip
+    return changed, figures
+
+
+def choose_quantizer(gaussians: Gaussians, bounds: Bounds, sh_degree: int) -> Quantizer:
+    """Ranges from the first keyframe with room for what later frames bring; frozen for the sequence."""
+    values = attribute_values(gaussians)  # [N, A]
+    low, high = (np.quantile(values, q, axis=0).astype(np.float64) for q in (0.0005, 0.9995))
+    margin = 0.15 * np.maximum(high - low, 1e-3)
+    low, high = low - margin, high + margin
+    # Axes trade places while they are fitted: one range for all three.
+    low[:3], high[:3] = low[:3].min(), high[:3].max()
+    low[3:6], high[3:6] = -1.0, 1.0
+    low[6], high[6] = OPACITY_RANGE
+    # What comes into view later may have any colour of the picture.
+    low[7:10], high[7:10] = np.minimum(low[7:10], -1.9).min(), np.maximum(high[7:10], 1.9).max()
+    if sh_degree > 0:
+        reach = max(np.abs(low[10:]).max(), np.abs(high[10:]).max())
+        low[10:], high[10:] = -reach, reach
+    distance = np.abs(gaussians.means.astype(np.float64) - bounds.centre).max(axis=0)
+    reach_xyz = 1.1 * np.maximum(distance, 1.5 * bounds.radius)
+    return Quantizer(bounds.centre.copy(), 0.5 * bounds.radius, reach_xyz, low, high, sh_degree)
+
+
+def _shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | None = None) -> list[Shot]:
+    """Pictures of the cameras that have one, and whose mask, if given, is not empty."""
+    shots = []
+    for index, camera in enumerate(views.cameras):
+        if masks is not None and (mask := masks[index]) is not None and not mask.any():
+            continue
+        target = views.picture(index, instant)
+        if target is not None:
+            shots.append(Shot(camera, target))
+    if masks is None and len(shots) < 2:
+        raise ValueError(f"instant {instant} has pictures of {len(shots)} cameras to fit, but needs two or more; "
+                         "choose another range with --frames")  # fmt: skip
+    return shots
+
+
+def _tiled(shots: Sequence[Shot], masks: Sequence[np.ndarray | None], solver: Solver, views: Views) -> list[Shot]:
+    """The same pictures, limited to the tiles that a mask or a Gaussian that may change touches."""
+    by_name = {camera.name: mask for camera, mask in zip(views.cameras, masks, strict=True)}
+    moving = rows_of(solver.model.gaussians, np.flatnonzero(solver.rows & (opacity(solver.model.gaussians) > 0.004)))
+    near = solver.bounds.near
+    return [
+        replace(shot, tiles=active_tiles(by_name[shot.camera.name], moving, shot.camera, near=near)) for shot in shots
+    ]
+
+
+def _labels(
+    gaussians: Gaussians,
+    quantizer: Quantizer,
+    views: Views,
+    masks: Sequence[np.ndarray | None],
+    bounds: Bounds,
+    options: FitOptions,
+) -> np.ndarray:  # bool [N]
+    """Gaussians that a motion mask touches in some camera (paper, algorithm 4)."""
+    drawn = quantizer.decode(quantizer.encode(gaussians))
+    return dynamic_labels(drawn, views.cameras, masks, near=bounds.near, options=options.labels)
+
+
+def _hull_gaussians(
+    views: Views,
+    instant: int,
+    masks: Sequence[np.ndarray | None],
+    bounds: Bounds,
+    options: FitOptions,
+    rng: np.random.Generator,
+) -> Gaussians:
+    """New Gaussians inside the hull of the masks: what moved there since the last keyframe has none yet."""
+    found = [(camera, views.picture(i, instant), masks[i]) for i, camera in enumerate(views.cameras)]
+    seeing = [(camera, picture, mask) for camera, picture, mask in found if picture is not None and mask is not None]
+    points = hull_points([s[0] for s in seeing], [s[1] for s in seeing], [s[2] for s in seeing], bounds=bounds,
+                         options=options.start, count=options.key_births, rng=rng)  # fmt: skip
+    spacing = neighbour_distance(points.xyz.astype(np.float32))
+    scale = np.clip(spacing, 1e-4 * bounds.radius, 0.02 * bounds.radius)
+    born = round_gaussians(points.xyz, points.rgb, scale, opacity=options.start.opacity, sh_degree=options.sh_degree)
+    return canonical(born)
+
+
+def _figures(started: float, loss: float, solver: Solver) -> dict[str, float]:
+    return {"seconds": time.monotonic() - started, "loss": loss, "gaussians": len(solver.model),
+            "changed": int(solver.rows.sum()), "iterations": solver.done,
+            "saturated": solver.known_quantizer.saturation(solver.model.gaussians)}  # fmt: skip
+
+
+class Track:
+    """A segment while it is fitted: the model, and the codes and figures of the frames that are done."""
+
+    def __init__(self, key: KeyState, model: Model, scratch: Path) -> None:
+        self.model = model
+        self.frames: list[Codes] = []
+        self.figures: list[dict[str, float]] = []
+        self._key = key
+        self._scratch = scratch
+        self._first = key.quantizer.encode(model.gaussians)
+        self._changed = np.zeros(len(model), bool)
+
+    @classmethod
+    def resume(cls, key: KeyState, options: FitOptions, scratch: Path) -> Track:
+        """Where the last call was cut off, or at the keyframe."""
+        model = Model(key.gaussians)
+        model.append(_empty_rows(options.spare, key))
+        track = cls(key, model, scratch)
+        path = scratch / "track.json"
+        if path.exists():
+            track._load(json.loads(path.read_text())["figures"])
+        return track
+
+    def add(self, frame: tuple[np.ndarray, dict[str, float]]) -> None:
+        """Take over the model as the next frame; `frame` tells which rows it changed, and figures."""
+        rows, figures = frame
+        self._changed |= rows
+        self.frames.append(self._key.quantizer.encode(self.model.gaussians))
+        self.figures.append(figures)
+
+    def checkpoint(self) -> None:
+        """Everything a later call needs. The list of frames is written last and decides what counts."""
+        count = len(self.frames)
+        codes = self.frames[-1]
+        write_npz(self._scratch / f"frame_{count:06d}.npz", {"xyz": codes.xyz, "attributes": codes.attributes})
+        state = {name: getattr(self.model.gaussians, name) for name in ATTRIBUTES}
+        write_npz(self._scratch / f"state_{count:06d}.npz", {**state, "changed": self._changed})
+        write_json(self._scratch / "track.json", {"figures": self.figures})
+        (self._scratch / f"state_{count - 1:06d}.npz").unlink(missing_ok=True)
+
+    def segment(self) -> Segment:
+        """The codes of all frames; rows that are never visible are left out."""
+        ever = self._first.attributes[:, OPACITY] > DEAD_CODE
+        for codes in self.frames:
+            ever |= codes.attributes[:, OPACITY] > DEAD_CODE
+        dynamic = self._changed & ever
+        width = self._first.attributes.shape[1]
+        xyz = (
+            np.stack([c.xyz[dynamic] for c in self.frames])
+            if self.frames
+            else np.empty((0, dynamic.sum(), 3), np.uint16)
+        )
+        attributes = (np.stack([c.attributes[dynamic] for c in self.frames])
+                      if self.frames else np.empty((0, dynamic.sum(), width), np.uint8))  # fmt: skip
+        return Segment(self._key.instant, self._first[ever], dynamic[ever], xyz, attributes)
+
+    def _load(self, figures: list[dict[str, float]]) -> None:
+        count = len(figures)
+        with np.load(self._scratch / f"state_{count:06d}.npz") as data:
+            self.model.overwrite(np.arange(len(self.model)), Gaussians(*(data[name] for name in ATTRIBUTES)))
+            self._changed = data["changed"]
+        for number in range(1, count + 1):
+            with np.load(self._scratch / f"frame_{number:06d}.npz") as data:
+                self.frames.append(Codes(data["xyz"], data["attributes"]))
+        self.figures = figures
+
+
+def _empty_rows(count: int, key: KeyState) -> Gaussians:
+    """Rows that no renderer draws."""
+    centre = np.repeat(key.bounds.centre[None], count, axis=0)
+    rows = round_gaussians(centre, np.full((count, 3), 0.5), np.full(count, 0.01 * key.bounds.radius), opacity=0.5,
+                           sh_degree=key.quantizer.sh_degree)  # fmt: skip
+    return replace(rows, opacity_logits=np.full(count, OPACITY_RANGE[0], np.float32))

@@ -1,0 +1,153 @@
+"""Where a sequence is cut into segments (paper §4.2.1 and appendix "Video Keyframing").
+
+M(t) is the mean magnitude of optical flow. Its highest peaks with a minimum separation become keyframes, because there
+a model carried on from frame to frame would drift most. The paper reads one camera; the median over all cameras also
+sees what that one does not.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+
+class Reason(StrEnum):
+    """Why an instant is a keyframe."""
+
+    START = "start"
+    PEAK = "peak"
+    SPLIT = "split"
+    """It halves (or thirds, ...) a stretch without a peak that is longer than `max_segment`"""
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """The first instant of a segment."""
+
+    instant: int
+    reason: Reason
+
+
+@dataclass(frozen=True)
+class KeyframeOptions:
+    """How segments are cut. Lengths are instants."""
+
+    camera: str | None = None
+    """Take M(t) from this camera, as the paper does; None: the median over all"""
+    smoothing: int = 5
+    """Width of the running mean before peaks are sought: two methods of flow agree on few of the raw peaks"""
+    separation: int = 30
+    """Least distance between keyframes (the paper's theta)"""
+    max_segment: int = 60
+    """Longest segment: the quality of a chain of frames falls with its length"""
+    peaks: int | None = None
+    """At most this many peaks, the highest (the paper's m - 1); None: all that stand out"""
+    prominence: float = 0.1
+    """How far a peak must rise above the valleys on its sides, share of the highest M(t)"""
+
+    def __post_init__(self) -> None:
+        if self.smoothing < 1 or self.smoothing % 2 == 0 or self.separation < 1 or (self.peaks or 0) < 0:
+            raise ValueError(
+                "smoothing must be odd and positive, separation positive and peaks not negative, but they are "
+                f"{self.smoothing}, {self.separation} and {self.peaks}"
+            )
+        if self.max_segment < 2 * self.separation - 1:
+            raise ValueError(
+                f"max_segment must be at least 2 * separation - 1 = {2 * self.separation - 1}, or halves of a segment "
+                f"come closer than {self.separation}, but is {self.max_segment}"
+            )
+        if not 0 <= self.prominence <= 1:
+            raise ValueError(f"prominence is a share from 0 to 1, not {self.prominence}")
+
+
+def motion_curve(magnitude: np.ndarray, names: Sequence[str], options: KeyframeOptions) -> np.ndarray:
+    """M(t), float64 [T], from the magnitudes [T, C] of cameras `names`, smoothed.
+
+    NaN marks cameras without a step to an instant; where no camera has one, M is interpolated in time, and 0 if none
+    has any.
+    """
+    if magnitude.ndim != 2 or magnitude.shape[1] != len(names) or not magnitude.size:
+        raise ValueError(f"magnitudes must be [T, {len(names)}] for {len(names)} cameras, but are {magnitude.shape}")
+    if options.camera is not None and options.camera not in names:
+        raise ValueError(f"no camera {options.camera!r} to take M(t) from; there are {', '.join(names)}")
+    columns = magnitude if options.camera is None else magnitude[:, [list(names).index(options.camera)]]
+    known = np.isfinite(columns).any(axis=1)
+    if not known.any():
+        return np.zeros(len(magnitude))
+    curve = np.interp(np.arange(len(columns)), np.flatnonzero(known), np.nanmedian(columns[known], axis=1))
+    return running_mean(curve, options.smoothing)
+
+
+def running_mean(values: np.ndarray, width: int) -> np.ndarray:
+    """Mean over the `width` (odd) values around each, fewer at the ends: float64 [T]."""
+    half, inner = width // 2, slice(width // 2, width // 2 + len(values))
+    # Sums of each window on its own, not differences of a running sum: a still stretch stays exactly 0.
+    sums = np.convolve(values.astype(np.float64), np.ones(2 * half + 1))[inner]
+    return sums / np.convolve(np.ones(len(values)), np.ones(2 * half + 1))[inner]
+
+
+def choose_keyframes(curve: np.ndarray, options: KeyframeOptions) -> list[Keyframe]:
+    """Keyframes of a motion curve, ascending; instant 0 is always the first.
+
+    Peaks are taken from the highest down (of equals the earlier), if they keep `separation` from all before; then
+    stretches longer than `max_segment` are divided evenly. Without any motion there is one keyframe.
+    """
+    if curve.ndim != 1 or not len(curve) or not (np.isfinite(curve).all() and (curve >= 0).all()):
+        raise ValueError(f"a motion curve must be finite, not negative and not empty, but is {curve.shape}: {curve}")
+    if not curve.any():
+        return [Keyframe(0, Reason.START)]
+    chosen = [0]
+    for peak in _peaks(curve, options.prominence * curve.max()):
+        if options.peaks is not None and len(chosen) > options.peaks:
+            break
+        place = bisect(chosen, peak)
+        if all(abs(peak - other) >= options.separation for other in chosen[place - 1 : place + 1]):
+            chosen.insert(place, peak)
+    keyframes = [Keyframe(instant, Reason.PEAK if instant else Reason.START) for instant in chosen]
+    splits = [Keyframe(instant, Reason.SPLIT) for instant in _splits(chosen, len(curve), options.max_segment)]
+    return sorted([*keyframes, *splits], key=lambda keyframe: keyframe.instant)
+
+
+def segments(keyframes: Sequence[Keyframe], count: int) -> list[range]:
+    """Instants of each segment, half-open, from its keyframe to the next; together they are range(count)."""
+    starts = [keyframe.instant for keyframe in keyframes]
+    if not starts or starts[0] != 0 or starts[-1] >= count or any(np.diff(starts) <= 0):
+        raise ValueError(f"keyframes must ascend from 0 and stay below {count}, but are {starts}")
+    return [range(first, last) for first, last in zip(starts, [*starts[1:], count], strict=True)]
+
+
+def _peaks(curve: np.ndarray, prominence: float) -> list[int]:
+    """Local maxima that stand out, the highest first. Of a plateau the first instant counts; the ends are no peaks."""
+    starts = np.flatnonzero(np.diff(curve, prepend=np.nan) != 0)  # of runs of equal values
+    runs = curve[starts]
+    inner = (runs[1:-1] > runs[:-2]) & (runs[1:-1] > runs[2:])
+    valleys = np.maximum(_valleys(runs), _valleys(runs[::-1])[::-1])
+    candidates = np.flatnonzero(inner) + 1
+    candidates = candidates[runs[candidates] - valleys[candidates] >= prominence]
+    return [int(starts[index]) for index in sorted(candidates, key=lambda index: (-runs[index], index))]
+
+
+def _valleys(values: np.ndarray) -> np.ndarray:
+    """The lowest value between each one and the last higher one before it, or the start: float64 [n]."""
+    rising: list[tuple[float, float]] = []  # value, and the lowest since the one below it on the stack
+    lowest = np.empty(len(values))
+    for index, value in enumerate(values):
+        low = value
+        while rising and rising[-1][0] <= value:
+            low = min(low, rising.pop()[1])
+        rising.append((value, low))
+        lowest[index] = low
+    return lowest
+
+
+def _splits(starts: Sequence[int], count: int, max_segment: int) -> list[int]:
+    """Instants that divide each stretch between starts, and up to the end, evenly into pieces of `max_segment`."""
+    found = []
+    for first, last in zip(starts, [*starts[1:], count], strict=True):
+        pieces = -(-(last - first) // max_segment)
+        found += [first + (last - first) * piece // pieces for piece in range(1, pieces)]
+    return found

@@ -1,0 +1,126 @@
+"""What the fit optimises: float32 Gaussians and the optimizer's memory of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from packuv.adam import AdamState, adam_step
+from packuv.quantize import Gaussians
+
+ATTRIBUTES = tuple(field.name for field in fields(Gaussians))
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Step sizes of Adam, per attribute; 3D Gaussian Splatting's values unless a reason is given."""
+
+    means: float = 1.6e-4
+    """Times the scene's radius"""
+    means_end: float = 0.02
+    """Share of the means' rate that is left at the end of a keyframe; falls exponentially"""
+    log_scales: float = 5e-3
+    quaternions: float = 1e-3
+    opacity_logits: float = 5e-2
+    sh_base: float = 2.5e-3
+    sh_rest: float = 1.25e-4
+
+    def columns(self, name: str, width: int, *, radius: float, progress: float) -> np.ndarray:
+        """float [width]: rate of each column of an attribute's flattened row."""
+        if name == "means":
+            return np.full(width, self.means * radius * self.means_end**progress)
+        if name == "sh":
+            rates = np.full(width, self.sh_rest)
+            rates[:3] = self.sh_base
+            return rates
+        return np.full(width, getattr(self, name))
+
+
+class Model:
+    """N Gaussians under optimisation. Rows are never reordered while they live."""
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        self.gaussians = Gaussians(*(np.array(getattr(gaussians, name), np.float32, order="C") for name in ATTRIBUTES))
+        self.moments = {name: AdamState.zeros(getattr(self.gaussians, name)) for name in ATTRIBUTES}
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def step(
+        self, gradients: Mapping[str, np.ndarray], rates: Rates, *, radius: float, progress: float, rows: np.ndarray
+    ) -> None:
+        """One step of Adam for the rows, bool [N]; the other rows keep values and moments bit for bit."""
+        for name in ATTRIBUTES:
+            values, gradient = getattr(self.gaussians, name), gradients[name]
+            width = values[0:1].size
+            adam_step(values, gradient, self.moments[name], rows=rows,
+                      rate=rates.columns(name, width, radius=radius, progress=progress))  # fmt: skip
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Forget every row that is not in `rows`, bool [N] or ascending indices."""
+        self.gaussians = Gaussians(*(np.ascontiguousarray(getattr(self.gaussians, name)[rows]) for name in ATTRIBUTES))
+        self.moments = {name: state.take(rows) for name, state in self.moments.items()}
+
+    def append(self, born: Gaussians) -> None:
+        """Add rows after the last one, with fresh moments."""
+        merged = [np.concatenate([getattr(g, name) for g in (self.gaussians, born)]) for name in ATTRIBUTES]
+        self.gaussians = Gaussians(*merged)
+        self.moments = {name: state.grown(len(born)) for name, state in self.moments.items()}
+
+    def overwrite(self, rows: np.ndarray, values: Gaussians) -> None:
+        """Give the rows, indices [n], new lives: values of n Gaussians and fresh moments."""
+        for name in ATTRIBUTES:
+            getattr(self.gaussians, name)[rows] = getattr(values, name)
+            state = self.moments[name]
+            state.first[rows], state.second[rows], state.steps[rows] = 0, 0, 0
+
+    def forget_moments(self, rows: np.ndarray, names: Sequence[str] = ATTRIBUTES) -> None:
+        """Start the optimizer afresh for the rows, as a new frame does."""
+        for name in names:
+            state = self.moments[name]
+            state.first[rows], state.second[rows], state.steps[rows] = 0, 0, 0
+
+
+def rows_of(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+    """Some rows, by index or mask, as copies."""
+    return Gaussians(*(getattr(gaussians, name)[rows].copy() for name in ATTRIBUTES))
+
+
+def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
+    """[N, 4] w x y z, any length, to [N, 3, 3]."""
+    w, x, y, z = (quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def canonical(gaussians: Gaussians) -> Gaussians:
+    """The same ellipsoids with axes sorted by falling size, turned so that w is the quaternion's largest component.
+
+    Of the 24 frames of an ellipsoid this one has w >= 0.5, so that x, y, z alone tell the rotation, and neighbouring
+    Gaussians get similar codes (research: 6 % of a key frame's size).
+    """
+    order = np.argsort(-gaussians.log_scales, axis=1, kind="stable")  # [N, 3]
+    axes = np.take_along_axis(rotation_matrices(gaussians.quaternions.astype(np.float64)), order[:, None, :], axis=2)
+    axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
+    flips = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], np.float64)
+    trace = np.einsum("nii,fi->nf", axes, flips)
+    axes = axes * flips[trace.argmax(axis=1)][:, None, :]
+    return replace(
+        gaussians,
+        log_scales=np.ascontiguousarray(np.take_along_axis(gaussians.log_scales, order, axis=1)),
+        quaternions=_quaternions_with_large_w(axes),
+    )
+
+
+def _quaternions_with_large_w(rotations: np.ndarray) -> np.ndarray:
+    """float32 [N, 4] from rotations [N, 3, 3] whose trace is not negative."""
+    w = 0.5 * np.sqrt(np.maximum(1 + np.trace(rotations, axis1=1, axis2=2), 1e-12))
+    r = rotations
+    vector = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1)
+    return np.concatenate([w[:, None], vector / (4 * w[:, None])], axis=1).astype(np.float32)

@@ -1,0 +1,342 @@
+"""The CPU rasterizer: projection, lists per tile, blending, and their gradients.
+
+The host side: it holds the buffers and calls the kernels in order. Float32 results do not depend on the number of
+threads, nor on the run.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from packuv.camera import PinholeCamera
+from packuv.quantize import Gaussians
+from packuv.raster import bins, blend
+from packuv.raster.project import CHUNKS, RECORD, TILE, project, project_backward, view_constants
+from packuv.raster.sh import MAX_DEGREE
+from packuv.raster.simd import Lanes, preferred_lanes
+
+BIN_CHUNKS = 16
+"""Pieces of the depth order that are put into tiles side by side."""
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """What every backend must agree on."""
+
+    near: float
+    """Gaussians whose centre is nearer than this along the viewing direction are not drawn; world units. No default:
+    it is a share of the rig's size, since cameras may sit in the wall they film."""
+    low_pass_px2: float = 0.3
+    """Added to both variances of every ellipse in the picture, pixels squared, as in 3D Gaussian Splatting."""
+
+    def __post_init__(self) -> None:
+        if not (self.near > 0 and self.low_pass_px2 > 0):
+            raise ValueError(
+                f"near plane and low-pass filter must be positive, but are {self.near}, {self.low_pass_px2}"
+            )
+
+
+class _Lease:
+    """Memory on loan; numpy arrays made from it keep it alive."""
+
+    def __init__(self, memory: np.ndarray, dtype: np.dtype, shape: tuple[int, ...]):
+        address, read_only = memory.__array_interface__["data"]
+        self.__array_interface__ = {
+            "version": 3, "typestr": dtype.str, "shape": shape, "data": (address, read_only),
+        }  # fmt: skip
+
+
+class Workspace:
+    """Memory for pictures and gradients, used again as soon as no array refers to it: a fit's memory stays flat.
+
+    Serves one thread at a time. An array that it handed out stays valid as long as anyone holds it or a view of it.
+    """
+
+    def __init__(self) -> None:
+        self._free: list[np.ndarray] = []
+
+    def take(self, shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
+        """An array, aligned to cache lines, whose content is undefined. O(number of free pieces)."""
+        shape = (shape,) if isinstance(shape, int) else shape
+        kind = np.dtype(dtype)
+        memory = self._memory(int(np.prod(shape)) * kind.itemsize)
+        lease = _Lease(memory, kind, shape)
+        weakref.finalize(lease, self._free.append, memory).atexit = False
+        return np.asarray(lease)
+
+    @property
+    def free_bytes(self) -> int:
+        """Memory that waits for its next use."""
+        return sum(piece.size for piece in self._free)
+
+    def _memory(self, size: int) -> np.ndarray:
+        fitting = [i for i, piece in enumerate(self._free) if piece.size >= size]
+        if fitting:
+            return self._free.pop(min(fitting, key=lambda i: self._free[i].size))
+        if self._free:  # the largest is too small, and would only lie about
+            self._free.pop(max(range(len(self._free)), key=lambda i: self._free[i].size))
+        return _aligned(size + size // 4 + 64)
+
+
+def _aligned(size: int) -> np.ndarray:
+    raw = np.empty(size + 64, np.uint8)
+    skip = -raw.ctypes.data % 64
+    return raw[skip : skip + size]
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """What the gradients need of a rendering."""
+
+    gaussians: Gaussians
+    view: np.ndarray
+    sh_degree: int
+    lanes: Lanes
+    workspace: Workspace
+    record: np.ndarray  # float32 [N, 16]
+    first_pair: np.ndarray  # int64 [N + 1]
+    pairs: np.ndarray  # uint32 [P, 3]
+    start: np.ndarray  # int64 [tiles + 1]
+    used_end: np.ndarray  # int64 [tiles]
+    visited: np.ndarray  # int32 [tiles]
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """A picture of Gaussians. Stays valid, for `backward` too, whatever else is rendered meanwhile.
+
+    The Gaussians' arrays must not change before `backward`.
+    """
+
+    colour: np.ndarray
+    """float32 [3, H, W], background included"""
+    depth: np.ndarray
+    """float32 [H, W]: sum of weight times z; divide by alpha for a mean"""
+    alpha: np.ndarray
+    """float32 [H, W]: 1 - transmittance"""
+    visible: np.ndarray
+    """int32 [N]: number of tiles whose pixels the Gaussian reaches, before occlusion"""
+    weights: np.ndarray | None
+    """float32 [N], if asked for: sum over pixels of transmittance * alpha"""
+    invalid_count: int
+    """Gaussians skipped because an attribute is not finite or absurd, or the quaternion is zero"""
+    _kept: _Kept = field(repr=False)
+
+    @property
+    def pair_count(self) -> int:
+        """(Gaussian, tile) pairs."""
+        return len(self._kept.pairs)
+
+    @property
+    def evaluation_count(self) -> int:
+        """(Gaussian, pixel) pairs that were computed, idle lanes included."""
+        return int(self._kept.visited.sum()) * len(self._kept.lanes)
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Derivatives of a scalar; zero in rows that were not asked for or not drawn."""
+
+    means: np.ndarray
+    """float32 [N, 3]"""
+    log_scales: np.ndarray
+    """float32 [N, 3]"""
+    quaternions: np.ndarray
+    """float32 [N, 4], of the quaternion as given, not normalised"""
+    opacity_logits: np.ndarray
+    """float32 [N]"""
+    sh: np.ndarray
+    """float32 [N, K, 3]; zero beyond the degree that was rendered"""
+    means2d: np.ndarray
+    """float32 [N, 2]: of the centre in the picture, per pixel"""
+    overflow_count: int
+    """Rows set to zero because their gradient was not finite"""
+
+
+def tile_shape(camera: PinholeCamera) -> tuple[int, int]:
+    """Rows and columns of tiles of 16 x 16 pixels that cover the picture."""
+    return -(-camera.height // TILE), -(-camera.width // TILE)
+
+
+def forward(
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    *,
+    options: RasterOptions,
+    sh_degree: int | None = None,
+    background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    tiles: np.ndarray | None = None,
+    weights: bool = False,
+    workspace: Workspace | None = None,
+    lanes: Lanes | None = None,
+) -> Rendering:
+    """Render N Gaussians.
+
+    `tiles`, bool as `tile_shape(camera)`, limits the work: elsewhere the picture shows background, alpha 0.
+    `sh_degree` may be less than the Gaussians carry. `weights` asks for the blending weight of each Gaussian.
+    `lanes` is for tests and benchmarks. Raises ValueError if shapes or types do not fit.
+    """
+    prefer_tbb()
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    _check(gaussians, degree)
+    lanes, workspace = lanes or preferred_lanes(), workspace or Workspace()
+    active = checked_tiles(tiles, camera)
+    view = view_constants(camera, options.near, options.low_pass_px2)
+    record, box, cells, invalid = _project(gaussians, degree, view, active, workspace)
+    visible, first_pair, pairs, start = _bin(record, box, cells, active, camera.height, lanes, workspace)
+    kept = _Kept(gaussians, view, degree, lanes, workspace, record, first_pair, pairs, start,
+                 workspace.take(len(start) - 1, np.int64), workspace.take(len(start) - 1, np.int32))  # fmt: skip
+    colour, depth, alpha, sums = _blend(kept, camera, np.asarray(background, np.float32), weights)
+    return Rendering(colour, depth, alpha, visible, sums, invalid, kept)
+
+
+def backward(
+    rendering: Rendering,
+    d_colour: np.ndarray,
+    d_depth: np.ndarray | None = None,
+    d_alpha: np.ndarray | None = None,
+    *,
+    rows: np.ndarray | None = None,
+) -> Gradients:
+    """Gradients of a scalar from its derivatives by the pictures.
+
+    d_colour [3, H, W], d_depth and d_alpha [H, W] or None for zero. `rows`, bool [N], names the Gaussians that may
+    change: for the others nothing is computed but the light that they take away.
+    """
+    kept = rendering._kept
+    gaussians, workspace, count = kept.gaussians, kept.workspace, len(kept.gaussians)
+    chosen = np.ones(count, np.uint8) if rows is None else _checked_rows(rows, count)
+    pictures = [rendering.colour, rendering.depth, rendering.alpha]
+    upstream = [_flat(d, p) for d, p in zip((d_colour, d_depth, d_alpha), pictures, strict=True)]
+    height, width = rendering.alpha.shape
+    pair_count = len(kept.pairs)
+    partial, used = workspace.take(pair_count * RECORD, np.float32), workspace.take(pair_count, np.uint8)
+    blend.blend_backward(kept.lanes, kept.record.reshape(-1), kept.pairs, kept.start, kept.used_end, -(-width // TILE),
+                         width, height, *(p.reshape(-1) for p in pictures), *upstream, chosen, partial, used,
+                         _jobs())  # fmt: skip
+    shapes = [(count, 3), (count, 3), (count, 4), (count,), gaussians.sh.shape, (count, 2)]
+    out = [workspace.take(shape, np.float32) for shape in shapes]
+    overflown = np.empty(CHUNKS, np.int64)
+    project_backward(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits,
+                     gaussians.sh, kept.sh_degree, kept.view, kept.record, chosen, kept.first_pair, used,
+                     partial.reshape(-1, RECORD), *out, overflown)  # fmt: skip
+    return Gradients(out[0], out[1], out[2], out[3], out[4], out[5], int(overflown.sum()))
+
+
+@cache
+def prefer_tbb() -> None:
+    """Load the environment's tbb, which numba does not find by itself, before numba chooses a threading layer.
+
+    Of numba's layers only tbb survives fork, spawn and several Python threads. Without it numba takes another.
+    """
+    library = Path(sys.prefix) / "lib" / "libtbb.so.12"
+    if library.exists():
+        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+
+
+def _jobs() -> int:
+    # More jobs than threads, since tiles differ in cost; results do not depend on it.
+    return 8 * numba.get_num_threads()
+
+
+def _check(gaussians: Gaussians, degree: int) -> None:
+    count = len(gaussians)
+    shapes = {"means": (count, 3), "log_scales": (count, 3), "quaternions": (count, 4), "opacity_logits": (count,),
+              "sh": (count, (gaussians.sh_degree + 1) ** 2, 3)}  # fmt: skip
+    for name, shape in shapes.items():
+        array = getattr(gaussians, name)
+        if array.shape != shape or array.dtype != np.float32 or not array.flags.c_contiguous:
+            raise ValueError(f"{name} must be C-contiguous float32 {shape}, but is {array.dtype} {array.shape}")
+    if not 0 <= degree <= min(gaussians.sh_degree, MAX_DEGREE):
+        raise ValueError(f"cannot render SH degree {degree}: these Gaussians carry degree {gaussians.sh_degree}, "
+                         f"and {MAX_DEGREE} is the highest there is")  # fmt: skip
+
+
+def _checked_rows(rows: np.ndarray, count: int) -> np.ndarray:
+    if rows.shape != (count,) or rows.dtype != bool:
+        raise ValueError(f"rows must be bool ({count},), but is {rows.dtype} {rows.shape}")
+    return np.ascontiguousarray(rows).view(np.uint8)
+
+
+def _flat(gradient: np.ndarray | None, picture: np.ndarray) -> np.ndarray:
+    if gradient is None:
+        return np.zeros(picture.size, np.float32)
+    if gradient.shape != picture.shape:
+        raise ValueError(f"the gradient of a picture {picture.shape} must have its shape, but has {gradient.shape}")
+    return np.ascontiguousarray(gradient, np.float32).reshape(-1)
+
+
+def checked_tiles(tiles: np.ndarray | None, camera: PinholeCamera) -> np.ndarray:
+    """Active tiles as uint8 [tiles_y, tiles_x], all where None; raises ValueError if the shape does not fit."""
+    shape = tile_shape(camera)
+    if tiles is None:
+        return np.ones(shape, np.uint8)
+    if tiles.shape != shape or tiles.dtype != bool:
+        raise ValueError(f"tiles must be bool {shape} for a picture of {camera.width}x{camera.height} pixels, "
+                         f"but is {tiles.dtype} {tiles.shape}")  # fmt: skip
+    return np.ascontiguousarray(tiles).view(np.uint8)
+
+
+def _project(gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, workspace: Workspace
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:  # fmt: skip
+    """Records, boxes, tiles per box, and how many Gaussians are invalid."""
+    count = len(gaussians)
+    active_sum = np.zeros((active.shape[0] + 1, active.shape[1] + 1), np.int32)
+    active_sum[1:, 1:] = active.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
+    record, box = workspace.take((count, RECORD), np.float32), workspace.take((count, 4), np.int32)
+    cells, invalid = workspace.take(count, np.int32), np.empty(CHUNKS, np.int64)
+    project(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits, gaussians.sh,
+            degree, view, active_sum, record, box, cells, invalid)  # fmt: skip
+    return record, box, cells, int(invalid.sum())
+
+
+def _bin(record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndarray, height: int, lanes: Lanes,
+         workspace: Workspace) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Tiles per Gaussian, first pair per Gaussian, pairs in tile and depth order, bounds of the tiles' lists."""
+    count, take = len(cells), workspace.take
+    order, keys = [take(count, np.int32) for _ in range(2)], [take(count, np.float32) for _ in range(2)]
+    drawn = bins.drawn(cells, record.reshape(-1), order[0], keys[0])
+    bins.sort_by_depth(drawn, order[0], keys[0].view(np.uint32), order[1], keys[1].view(np.uint32),
+                       np.empty((3, 2048), np.int64))  # fmt: skip
+    first_cell, first_pair = take(count + 1, np.int64), take(count + 1, np.int64)
+    cell_count = bins.running_sum(cells, first_cell)
+    tiles, masks, visible = take(cell_count, np.int32), take(cell_count, np.uint32), take(count, np.int32)
+    bins.find_tiles(lanes, box, cells, first_cell, record.reshape(-1), active, height, tiles, masks, visible)
+    pairs = take((int(bins.running_sum(visible, first_pair)), 3), np.uint32)
+    histogram, start = take((BIN_CHUNKS, active.size), np.int64), take(active.size + 1, np.int64)
+    bins.count_pairs(drawn, order[1], first_cell, visible, tiles, histogram)
+    bins.start_tiles(histogram, start)
+    bins.scatter_pairs(drawn, order[1], first_cell, first_pair, tiles, masks, histogram, pairs)
+    return visible, first_pair, pairs, start
+
+
+def _blend(kept: _Kept, camera: PinholeCamera, background: np.ndarray, weights: bool
+           ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:  # fmt: skip
+    """Colour, depth, alpha, and the blending weights if they are wanted."""
+    take, width, height = kept.workspace.take, camera.width, camera.height
+    colour, depth, alpha = (
+        take((3, height, width), np.float32),
+        take((height, width), np.float32),
+        take((height, width), np.float32),
+    )
+    pair_count = len(kept.pairs)
+    partial = take(pair_count * RECORD if weights else 0, np.float32)
+    blend.blend(kept.lanes, kept.record.reshape(-1), kept.pairs, kept.start, tile_shape(camera)[1], width, height,
+                background, colour.reshape(-1), depth.reshape(-1), alpha.reshape(-1), kept.used_end, kept.visited,
+                partial, _jobs())  # fmt: skip
+    if not weights:
+        return colour, depth, alpha, None
+    sums = take(len(kept.gaussians), np.float32)
+    blend.gather_weights(
+        partial, kept.first_pair, kept.start, kept.used_end, kept.pairs, take(pair_count, np.uint8), sums
+    )
+    return colour, depth, alpha, sums

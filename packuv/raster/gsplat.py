@@ -1,0 +1,172 @@
+"""The CUDA rasterizer: gsplat 1.5 behind the functions and conventions of the CPU one.
+
+Fields of `Gaussians` and of all results are CUDA tensors here. gsplat is an optional dependency, imported when first
+used. It differs in three things: versions differ in the cap on alpha (0.999 or 0.99, ours 0.99), sums on the GPU
+have no fixed order, and tiles cannot be left out, so a mask of tiles is laid over the finished picture and saves no
+time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from packuv.camera import PinholeCamera
+from packuv.quantize import Gaussians
+from packuv.raster.cpu import Gradients, RasterOptions, checked_tiles
+from packuv.raster.project import MAX_COLOUR, MAX_LENGTH, MAX_LOG_SCALE, TILE
+
+_FAR = 1e10
+
+
+@dataclass(frozen=True)
+class TensorRendering:
+    """A picture of Gaussians on a GPU; the fields mean what they mean in `cpu.Rendering`."""
+
+    colour: Tensor
+    """float32 [3, H, W], background included"""
+    depth: Tensor
+    """float32 [H, W]: sum of weight times z"""
+    alpha: Tensor
+    """float32 [H, W]"""
+    visible: Tensor
+    """int32 [N]: tiles that the Gaussian's bounding box touches"""
+    weights: Tensor | None
+    """float32 [N], if asked for: sum over pixels of transmittance * alpha"""
+    invalid_count: int
+    """Gaussians skipped because an attribute is not finite or absurd, or the quaternion is zero"""
+    _leaves: tuple[Tensor, ...] = field(repr=False)
+    _means2d: Tensor = field(repr=False)
+
+
+def forward(
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    *,
+    options: RasterOptions,
+    sh_degree: int | None = None,
+    background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    tiles: np.ndarray | None = None,
+    weights: bool = False,
+) -> TensorRendering:
+    """Render Gaussians whose fields are float32 CUDA tensors; arguments as in `cpu.forward`.
+
+    Raises ImportError, saying what to install, where gsplat is missing.
+    """
+    leaves = tuple(tensor.detach().requires_grad_() for tensor in _fields(gaussians))
+    scene, valid = _sanitized(*leaves)
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    with torch.enable_grad():
+        values, alpha, meta = _rasterize(scene, scene["sh"], camera, options, degree, "RGB+D")
+        colour, depth, alpha = _composed(values, alpha, _pixel_mask(tiles, camera, alpha), background)
+    sums = _weights(scene, camera, options, tiles) if weights else None
+    visible = meta["tiles_per_gauss"].reshape(-1).to(torch.int32)
+    return TensorRendering(colour, depth, alpha, visible, sums, int((~valid).sum()), leaves, meta["means2d"])
+
+
+def backward(
+    rendering: TensorRendering,
+    d_colour: Tensor,
+    d_depth: Tensor | None = None,
+    d_alpha: Tensor | None = None,
+    *,
+    rows: Tensor | None = None,
+) -> Gradients:
+    """Gradients as in `cpu.backward`, as tensors. The rendering can be used once: its graph is freed."""
+    pairs = [(rendering.colour, d_colour), (rendering.depth, d_depth), (rendering.alpha, d_alpha)]
+    given = [(picture, gradient) for picture, gradient in pairs if gradient is not None]
+    inputs = (*rendering._leaves, rendering._means2d)
+    pictures, upstream = [picture for picture, _ in given], [gradient for _, gradient in given]
+    found = torch.autograd.grad(pictures, inputs, upstream, allow_unused=True)
+    whole = [torch.zeros_like(a) if g is None else g for g, a in zip(found, inputs, strict=True)]
+    whole[5] = whole[5].reshape(-1, 2)  # [1, N, 2] of one camera
+    finite = torch.stack([g.reshape(len(g), -1).isfinite().all(1) for g in whole]).all(0)
+    keep = finite if rows is None else finite & rows
+    kept = [torch.where(keep.reshape(-1, *[1] * (g.ndim - 1)), g, 0) for g in whole]
+    arrays: list[Any] = kept
+    return Gradients(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], arrays[5], int((~finite).sum()))
+
+
+def _fields(gaussians: Any) -> tuple[Tensor, ...]:
+    return (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits, gaussians.sh)
+
+
+def _sanitized(means: Tensor, log_scales: Tensor, quaternions: Tensor, logits: Tensor, sh: Tensor
+               ) -> tuple[dict[str, Tensor], Tensor]:  # fmt: skip
+    """gsplat's inputs, with invalid rows replaced by harmless ones of opacity 0, and which rows are valid, bool [N]."""
+    with torch.no_grad():
+        valid = (means.abs().amax(1) <= MAX_LENGTH) & (log_scales.amax(1) <= MAX_LOG_SCALE)
+        valid &= log_scales.isfinite().all(1) & logits.isfinite() & quaternions.isfinite().all(1)
+        valid &= (sh.abs().flatten(1).amax(1) <= MAX_COLOUR) & (quaternions.double().square().sum(1) > 1e-24)
+    row = valid[:, None]
+    scene = {
+        "means": torch.where(row, means, 0),
+        "quats": torch.where(row, quaternions, torch.tensor([1.0, 0, 0, 0], device=means.device)),
+        "scales": torch.where(row, log_scales, 0).exp(),
+        "opacities": torch.where(valid, torch.sigmoid(torch.where(valid, logits, 0)), 0),
+        "sh": torch.where(row[..., None], sh, 0),
+    }
+    return scene, valid
+
+
+def _rasterize(scene: dict[str, Tensor], colours: Tensor, camera: PinholeCamera, options: RasterOptions,
+               sh_degree: int | None, mode: str) -> tuple[Tensor, Tensor, dict[str, Any]]:  # fmt: skip
+    """One camera: values [H, W, D], alpha [H, W], gsplat's intermediate results."""
+    like: dict[str, Any] = {"dtype": torch.float32, "device": colours.device}
+    geometry = {name: scene[name] for name in ("means", "quats", "scales", "opacities")}
+    values, alpha, meta = _gsplat().rasterization(
+        **geometry,
+        colors=colours,
+        viewmats=torch.as_tensor(camera.camera_from_world, **like)[None],
+        Ks=torch.as_tensor(camera.matrix, **like)[None],
+        width=camera.width,
+        height=camera.height,
+        near_plane=options.near,
+        far_plane=_FAR,
+        eps2d=options.low_pass_px2,
+        sh_degree=sh_degree,
+        packed=False,
+        tile_size=TILE,
+        render_mode=mode,
+        rasterize_mode="classic",
+    )
+    return values[0], alpha[0, ..., 0], meta
+
+
+def _composed(values: Tensor, alpha: Tensor, mask: Tensor, background: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour over the background, depth and alpha; nothing but background where the mask is 0."""
+    alpha, values = alpha * mask, values * mask[..., None]
+    behind = torch.as_tensor(np.asarray(background, np.float32), device=alpha.device)
+    colour = values[..., :3].permute(2, 0, 1) + (1 - alpha) * behind[:, None, None]
+    return colour, values[..., 3], alpha
+
+
+def _pixel_mask(tiles: np.ndarray | None, camera: PinholeCamera, like: Tensor) -> Tensor:
+    """1 in active tiles, 0 elsewhere, [H, W]."""
+    active = checked_tiles(tiles, camera).astype(np.float32)
+    mask = active.repeat(TILE, axis=0).repeat(TILE, axis=1)[: camera.height, : camera.width]
+    return torch.as_tensor(np.ascontiguousarray(mask), device=like.device)
+
+
+def _weights(scene: dict[str, Tensor], camera: PinholeCamera, options: RasterOptions, tiles: np.ndarray | None
+             ) -> Tensor:  # fmt: skip
+    """Blending weight per Gaussian: the derivative of a picture's sum by a colour that all Gaussians share."""
+    frozen = {name: tensor.detach() for name, tensor in scene.items()}
+    ones = torch.ones((len(frozen["means"]), 1), device=frozen["means"].device, requires_grad=True)
+    with torch.enable_grad():
+        values, alpha, _ = _rasterize(frozen, ones, camera, options, None, "RGB")
+        total = (values[..., 0] * _pixel_mask(tiles, camera, alpha)).sum()
+    return torch.autograd.grad(total, ones)[0][:, 0]
+
+
+def _gsplat() -> Any:
+    try:
+        import gsplat
+    except ImportError as error:
+        raise ImportError("rendering on a GPU needs gsplat: pip install 'packuv[cuda]'") from error
+    return gsplat

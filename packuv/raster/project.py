@@ -1,0 +1,406 @@
+"""From Gaussians in the world to ellipses in the picture, and the gradients back (EWA splatting).
+
+Scalar code in double precision: the determinant of a large ellipse leaves the range of float32. An invalid Gaussian is
+skipped and counted: an attribute that is not finite, a position beyond `MAX_LENGTH` or a scale beyond
+`MAX_LOG_SCALE`, a colour beyond `MAX_COLOUR`, a quaternion of length zero.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+from packuv.camera import PinholeCamera
+from packuv.raster import sh as harmonics
+
+TILE = 16
+"""Pixels along a side of a tile."""
+CHUNKS = 64
+"""Pieces of work of a loop over Gaussians; fixed, so that no result depends on the number of threads."""
+ALPHA_MIN = 1.0 / 255.0
+MAX_LENGTH = 1e18
+"""World units; squares of larger positions leave the range of float32."""
+MAX_LOG_SCALE = 40.0
+MAX_COLOUR = 1e12
+MARGIN = 0.15
+"""The local linear map of a Gaussian outside the picture is taken at most this share of the picture beyond its edge."""
+
+# Columns of a record: one Gaussian as the blending needs it, a cache line of 16 float32.
+# alpha = 2 ** (LOG_OPACITY + XX dx^2 + XY dx dy + YY dy^2)
+X, Y, XX, XY, YY, LOG_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
+# The outline where alpha = 1/255, for the exact test of rows of pixels against it:
+SHEAR, INVERSE_XX, INVERSE_VARIANCE_Y, REACH = range(10, 14)
+RECORD = 16
+
+# Entries of a view.
+_ROTATION, _TRANSLATION, _FX, _FY, _CX, _CY, _CENTRE, _WIDTH, _HEIGHT = 0, 9, 12, 13, 14, 15, 16, 19, 20
+_SLOPE_LIMITS, _NEAR, _LOW_PASS = 21, 25, 26
+
+_LOG2E = 1.4426950408889634
+_f32 = np.float32
+_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True, "fastmath": {"contract", "nsz"}}
+
+
+def view_constants(camera: PinholeCamera, near: float, low_pass_px2: float) -> np.ndarray:
+    """Everything the kernels need to know of a camera, float64 [27]."""
+    width, height = camera.width, camera.height
+    x_low, x_high = -camera.cx - MARGIN * width, width - camera.cx + MARGIN * width
+    y_low, y_high = -camera.cy - MARGIN * height, height - camera.cy + MARGIN * height
+    return np.array([
+        *camera.camera_from_world[:3, :3].ravel(), *camera.camera_from_world[:3, 3],
+        camera.fx, camera.fy, camera.cx, camera.cy, *camera.centre, width, height,
+        x_low / camera.fx, x_high / camera.fx, y_low / camera.fy, y_high / camera.fy, near, low_pass_px2,
+    ], dtype=np.float64)  # fmt: skip
+
+
+@njit(**_OPTIONS)
+def _in_camera(view, x, y, z):
+    """A world point on the camera's axes."""
+    return (
+        view[0] * x + view[1] * y + view[2] * z + view[9],
+        view[3] * x + view[4] * y + view[5] * z + view[10],
+        view[6] * x + view[7] * y + view[8] * z + view[11],
+    )
+
+
+@njit(**_OPTIONS)
+def _linear_map(view, x, y, z):
+    """Jacobian of the projection at a point on the camera's axes (4 entries that are not zero), and the same after the
+    camera's rotation, [2, 3] by rows."""
+    slope_x = min(max(x / z, view[_SLOPE_LIMITS]), view[_SLOPE_LIMITS + 1])
+    slope_y = min(max(y / z, view[_SLOPE_LIMITS + 2]), view[_SLOPE_LIMITS + 3])
+    a, c = view[_FX] / z, -view[_FX] * slope_x / z
+    b, d = view[_FY] / z, -view[_FY] * slope_y / z
+    return (a, c, b, d), (
+        a * view[0] + c * view[6], a * view[1] + c * view[7], a * view[2] + c * view[8],
+        b * view[3] + d * view[6], b * view[4] + d * view[7], b * view[5] + d * view[8],
+    )  # fmt: skip
+
+
+@njit(**_OPTIONS)
+def _rotation(w, x, y, z):
+    """Rotation matrix of a unit quaternion, by rows."""
+    return (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@njit(**_OPTIONS)
+def _screen_axes(u, r, s0, s1, s2):
+    """The three axes of a Gaussian in the picture, pixels: M = U R S, [2, 3] by rows."""
+    return (
+        s0 * (u[0] * r[0] + u[1] * r[3] + u[2] * r[6]),
+        s1 * (u[0] * r[1] + u[1] * r[4] + u[2] * r[7]),
+        s2 * (u[0] * r[2] + u[1] * r[5] + u[2] * r[8]),
+        s0 * (u[3] * r[0] + u[4] * r[3] + u[5] * r[6]),
+        s1 * (u[3] * r[1] + u[4] * r[4] + u[5] * r[7]),
+        s2 * (u[3] * r[2] + u[4] * r[5] + u[5] * r[8]),
+    )
+
+
+@njit(**_OPTIONS)
+def _covariance(m, low_pass):
+    """xx, xy, yy of M M^T plus the low-pass filter, pixels^2, and the determinant.
+
+    The determinant is |row0 x row1|^2 + low_pass * trace - low_pass^2 (Lagrange): a thin ellipse cancels nothing.
+    """
+    xx = m[0] * m[0] + m[1] * m[1] + m[2] * m[2] + low_pass
+    xy = m[0] * m[3] + m[1] * m[4] + m[2] * m[5]
+    yy = m[3] * m[3] + m[4] * m[4] + m[5] * m[5] + low_pass
+    n0, n1, n2 = m[1] * m[5] - m[2] * m[4], m[2] * m[3] - m[0] * m[5], m[0] * m[4] - m[1] * m[3]
+    return xx, xy, yy, n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (xx + yy) - low_pass * low_pass
+
+
+@njit(**_OPTIONS)
+def _is_valid(means, log_scales, quaternions, logits, i):
+    length = max(abs(means[i, 0]), max(abs(means[i, 1]), abs(means[i, 2])))
+    size = max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2]))
+    # One sum finds every value that is not finite; in double precision finite float32 values cannot overflow it.
+    total = np.float64(means[i, 0]) + means[i, 1] + means[i, 2] + logits[i]
+    total += np.float64(log_scales[i, 0]) + log_scales[i, 1] + log_scales[i, 2]
+    square = 0.0
+    for k in range(4):
+        square += np.float64(quaternions[i, k]) * quaternions[i, k]
+    return math.isfinite(total + square) and length <= MAX_LENGTH and size <= MAX_LOG_SCALE and square > 1e-24
+
+
+@njit(**_OPTIONS)
+def _outline_box(view, x, y, xx, yy, reach, box, i):
+    """Write the tiles [x0, y0, x1, y1], both ends included, that the outline's bounding box touches; False if none."""
+    half_x, half_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
+    x0, x1 = math.ceil(max(x - half_x - 0.5, 0.0)), math.floor(min(x + half_x - 0.5, view[_WIDTH] - 1))
+    y0, y1 = math.ceil(max(y - half_y - 0.5, 0.0)), math.floor(min(y + half_y - 0.5, view[_HEIGHT] - 1))
+    if not (x0 <= x1 and y0 <= y1):
+        return False
+    box[i, 0], box[i, 1], box[i, 2], box[i, 3] = int(x0) >> 4, int(y0) >> 4, int(x1) >> 4, int(y1) >> 4
+    return True
+
+
+@njit(**_OPTIONS)
+def _active_tiles(active_sum, box, i):
+    """Number of active tiles inside a box, from their summed-area table."""
+    x0, y0, x1, y1 = box[i, 0], box[i, 1], box[i, 2] + 1, box[i, 3] + 1
+    return active_sum[y1, x1] - active_sum[y0, x1] - active_sum[y1, x0] + active_sum[y0, x0]
+
+
+@njit(**_OPTIONS)
+def _direction(view, means, i):
+    """Unit vector from the camera to a Gaussian, world, and one over the distance."""
+    x, y, z = means[i, 0] - view[_CENTRE], means[i, 1] - view[_CENTRE + 1], means[i, 2] - view[_CENTRE + 2]
+    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return _f32(x * inverse), _f32(y * inverse), _f32(z * inverse), inverse
+
+
+@njit(**_OPTIONS)
+def _colour(view, means, sh, degree, values, record, i):
+    """Write max(0, 0.5 + SH); False if it is not a usable number. `values` is scratch, float32 [16]."""
+    x, y, z, _ = _direction(view, means, i)
+    harmonics.basis(degree, x, y, z, values)
+    r = g = b = _f32(0.5)
+    for k in range((degree + 1) * (degree + 1)):
+        r += values[k] * sh[i, k, 0]
+        g += values[k] * sh[i, k, 1]
+        b += values[k] * sh[i, k, 2]
+    record[i, RED], record[i, GREEN], record[i, BLUE] = max(r, _f32(0)), max(g, _f32(0)), max(b, _f32(0))
+    return abs(r) <= MAX_COLOUR and abs(g) <= MAX_COLOUR and abs(b) <= MAX_COLOUR
+
+
+@njit(**_OPTIONS)
+def _project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
+    """Fill the record (but for the colour) and the box of one valid Gaussian; False if it is not drawn."""
+    x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
+    opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
+    if not (z >= view[_NEAR] and opacity >= ALPHA_MIN):
+        return False
+    q0, q1, q2, q3 = _unit(quaternions, i)
+    _, u = _linear_map(view, x, y, z)
+    s0, s1, s2 = (
+        math.exp(np.float64(log_scales[i, 0])),
+        math.exp(np.float64(log_scales[i, 1])),
+        math.exp(np.float64(log_scales[i, 2])),
+    )
+    xx, xy, yy, determinant = _covariance(_screen_axes(u, _rotation(q0, q1, q2, q3), s0, s1, s2), view[_LOW_PASS])
+    reach = 2.0 * math.log(opacity * 255.0)
+    px, py = view[_FX] * x / z + view[_CX], view[_FY] * y / z + view[_CY]
+    if not _outline_box(view, px, py, xx, yy, reach, box, i) or _active_tiles(active_sum, box, i) == 0:
+        return False
+    record[i, X], record[i, Y], record[i, DEPTH] = px, py, z
+    record[i, XX], record[i, YY] = -0.5 * _LOG2E * yy / determinant, -0.5 * _LOG2E * xx / determinant
+    record[i, XY], record[i, LOG_OPACITY] = _LOG2E * xy / determinant, math.log2(opacity)
+    record[i, SHEAR], record[i, INVERSE_VARIANCE_Y], record[i, REACH] = -xy / yy, 1.0 / yy, reach
+    record[i, INVERSE_XX] = min(determinant / yy, 1e30)
+    return True
+
+
+@njit(**_OPTIONS)
+def _unit(quaternions, i):
+    w, x, y, z = (np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]),
+                  np.float64(quaternions[i, 3]))  # fmt: skip
+    inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return w * inverse, x * inverse, y * inverse, z * inverse
+
+
+@njit(parallel=True, **_OPTIONS)
+def project(means, log_scales, quaternions, logits, sh, degree, view, active_sum, record, box, cells, invalid):
+    """Fill records [N, 16], boxes [N, 4] (tiles) and `cells` [N], the number of tiles in the box, 0 if not drawn.
+
+    `active_sum` [tiles_y + 1, tiles_x + 1] is the summed-area table of the active tiles; `invalid` [CHUNKS] receives
+    how many Gaussians were skipped as invalid.
+    """
+    count = means.shape[0]
+    for chunk in prange(CHUNKS):
+        values = np.empty(16, np.float32)
+        bad = 0
+        for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
+            cells[i] = 0
+            if not _is_valid(means, log_scales, quaternions, logits, i):
+                bad += 1
+            elif _project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
+                if _colour(view, means, sh, degree, values, record, i):
+                    cells[i] = (box[i, 2] - box[i, 0] + 1) * (box[i, 3] - box[i, 1] + 1)
+                else:
+                    bad += 1
+        invalid[chunk] = bad
+
+
+# -- gradients ------------------------------------------------------------------------------------------------------
+
+
+@njit(**_OPTIONS)
+def _sum_pairs(partial, used, begin, end, out):
+    """Sum the partial gradients of one Gaussian over its tiles, in their order; False if no tile drew it."""
+    out[:] = _f32(0)
+    hit = False
+    for slot in range(begin, end):
+        if used[slot] != 0:
+            hit = True
+            for k in range(10):
+                out[k] += partial[slot, k]
+    return hit
+
+
+@njit(**_OPTIONS)
+def _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i):
+    """Write the gradient of the coefficients; return that of the position through the viewing direction."""
+    x, y, z, inverse = _direction(view, means, i)
+    harmonics.basis(degree, x, y, z, values)
+    r = g[6] if record[i, RED] > 0 else _f32(0)
+    gr = g[7] if record[i, GREEN] > 0 else _f32(0)
+    b = g[8] if record[i, BLUE] > 0 else _f32(0)
+    for k in range((degree + 1) * (degree + 1)):
+        d_sh[i, k, 0], d_sh[i, k, 1], d_sh[i, k, 2] = values[k] * r, values[k] * gr, values[k] * b
+        d_values[k] = r * sh[i, k, 0] + gr * sh[i, k, 1] + b * sh[i, k, 2]
+    for k in range((degree + 1) * (degree + 1), sh.shape[1]):
+        d_sh[i, k, 0], d_sh[i, k, 1], d_sh[i, k, 2] = _f32(0), _f32(0), _f32(0)
+    gx, gy, gz = harmonics.direction_gradient(degree, x, y, z, d_values)
+    along = gx * x + gy * y + gz * z
+    return (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse
+
+
+@njit(**_OPTIONS)
+def _axes_gradient(m, xx, xy, yy, determinant, g):
+    """Gradient of M [2, 3] by rows, from the moments of the exponent's gradient."""
+    a, b, c = yy / determinant, -xy / determinant, xx / determinant  # the inverse covariance
+    ga, gb, gc = -0.5 * g[3], -0.5 * g[4], -0.5 * g[5]
+    t00, t01, t10, t11 = a * ga + b * gb, a * gb + b * gc, b * ga + c * gb, b * gb + c * gc
+    k00, k01, k11 = -(t00 * a + t01 * b), -(t00 * b + t01 * c), -(t10 * b + t11 * c)
+    return (
+        2 * (k00 * m[0] + k01 * m[3]), 2 * (k00 * m[1] + k01 * m[4]), 2 * (k00 * m[2] + k01 * m[5]),
+        2 * (k01 * m[0] + k11 * m[3]), 2 * (k01 * m[1] + k11 * m[4]), 2 * (k01 * m[2] + k11 * m[5]),
+    )  # fmt: skip
+
+
+@njit(**_OPTIONS)
+def _quaternion_gradient(w, x, y, z, d, u):
+    """Gradient of the unit quaternion, from d = dL/d(U R) [2, 3] and U [2, 3]."""
+    r00, r01, r02 = u[0] * d[0] + u[3] * d[3], u[0] * d[1] + u[3] * d[4], u[0] * d[2] + u[3] * d[5]
+    r10, r11, r12 = u[1] * d[0] + u[4] * d[3], u[1] * d[1] + u[4] * d[4], u[1] * d[2] + u[4] * d[5]
+    r20, r21, r22 = u[2] * d[0] + u[5] * d[3], u[2] * d[1] + u[5] * d[4], u[2] * d[2] + u[5] * d[5]
+    gw = 2 * (x * (r21 - r12) + y * (r02 - r20) + z * (r10 - r01))
+    gx = 2 * (-2 * x * (r11 + r22) + y * (r01 + r10) + z * (r02 + r20) + w * (r21 - r12))
+    gy = 2 * (x * (r01 + r10) - 2 * y * (r00 + r22) + z * (r12 + r21) + w * (r02 - r20))
+    gz = 2 * (x * (r02 + r20) + y * (r12 + r21) - 2 * z * (r00 + r11) + w * (r10 - r01))
+    along = gw * w + gx * x + gy * y + gz * z
+    return gw - along * w, gx - along * x, gy - along * y, gz - along * z
+
+
+@njit(**_OPTIONS)
+def _map_gradient(view, d, r):
+    """Gradient of the four entries of the projection's Jacobian, from d = dL/d(U R) and the rotation R."""
+    e0, e1, e2 = (
+        d[0] * r[0] + d[1] * r[1] + d[2] * r[2],
+        d[0] * r[3] + d[1] * r[4] + d[2] * r[5],
+        d[0] * r[6] + d[1] * r[7] + d[2] * r[8],
+    )
+    e3, e4, e5 = (
+        d[3] * r[0] + d[4] * r[1] + d[5] * r[2],
+        d[3] * r[3] + d[4] * r[4] + d[5] * r[5],
+        d[3] * r[6] + d[4] * r[7] + d[5] * r[8],
+    )
+    return (
+        e0 * view[0] + e1 * view[1] + e2 * view[2], e0 * view[6] + e1 * view[7] + e2 * view[8],
+        e3 * view[3] + e4 * view[4] + e5 * view[5], e3 * view[6] + e4 * view[7] + e5 * view[8],
+    )  # fmt: skip
+
+
+@njit(**_OPTIONS)
+def _point_gradient(view, x, y, z, g, screen, jacobian, d_jacobian):
+    """Gradient of the position, world, from those of the picture's position, the depth and the Jacobian."""
+    u, v = x / z, y / z
+    px, py = screen[0] * view[_FX] / z, screen[1] * view[_FY] / z
+    pz = g[9] - px * u - py * v
+    a, c, b, d = jacobian
+    pz -= (d_jacobian[0] * a + d_jacobian[1] * c + d_jacobian[2] * b + d_jacobian[3] * d) / z
+    if view[_SLOPE_LIMITS] < u < view[_SLOPE_LIMITS + 1]:
+        through = -view[_FX] / (z * z) * d_jacobian[1]
+        px, pz = px + through, pz - through * u
+    if view[_SLOPE_LIMITS + 2] < v < view[_SLOPE_LIMITS + 3]:
+        through = -view[_FY] / (z * z) * d_jacobian[3]
+        py, pz = py + through, pz - through * v
+    return (
+        view[0] * px + view[3] * py + view[6] * pz,
+        view[1] * px + view[4] * py + view[7] * pz,
+        view[2] * px + view[5] * py + view[8] * pz,
+    )
+
+
+@njit(**_OPTIONS)
+def _project_one_backward(means, log_scales, quaternions, logits, view, g, d_log_scales, d_quaternions, d_logits,
+                          d_screen, i):  # fmt: skip
+    """Write every gradient of one Gaussian but those through its colour; return that of its position."""
+    x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
+    jacobian, u = _linear_map(view, x, y, z)
+    q0, q1, q2, q3 = _unit(quaternions, i)
+    r = _rotation(q0, q1, q2, q3)
+    s0, s1, s2 = (
+        math.exp(np.float64(log_scales[i, 0])),
+        math.exp(np.float64(log_scales[i, 1])),
+        math.exp(np.float64(log_scales[i, 2])),
+    )
+    m = _screen_axes(u, r, s0, s1, s2)
+    xx, xy, yy, determinant = _covariance(m, view[_LOW_PASS])
+    screen = (yy * g[1] - xy * g[2]) / determinant, (xx * g[2] - xy * g[1]) / determinant
+    d_screen[i, 0], d_screen[i, 1] = screen[0], screen[1]
+    d = _axes_gradient(m, xx, xy, yy, determinant, g)
+    d_log_scales[i, 0] = d[0] * m[0] + d[3] * m[3]
+    d_log_scales[i, 1] = d[1] * m[1] + d[4] * m[4]
+    d_log_scales[i, 2] = d[2] * m[2] + d[5] * m[5]
+    d = d[0] * s0, d[1] * s1, d[2] * s2, d[3] * s0, d[4] * s1, d[5] * s2
+    w = 0.0
+    for k in range(4):
+        w += np.float64(quaternions[i, k]) * quaternions[i, k]
+    inverse = 1.0 / math.sqrt(w)
+    h = _quaternion_gradient(q0, q1, q2, q3, d, u)
+    d_quaternions[i, 0], d_quaternions[i, 1] = h[0] * inverse, h[1] * inverse
+    d_quaternions[i, 2], d_quaternions[i, 3] = h[2] * inverse, h[3] * inverse
+    d_logits[i] = g[0] / (1.0 + math.exp(np.float64(logits[i])))  # d alpha / d logit = alpha (1 - opacity)
+    return _point_gradient(view, x, y, z, g, screen, jacobian, _map_gradient(view, d, r))
+
+
+@njit(**_OPTIONS)
+def _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
+    d_means[i, :] = _f32(0)
+    d_log_scales[i, :] = _f32(0)
+    d_quaternions[i, :] = _f32(0)
+    d_logits[i] = _f32(0)
+    d_screen[i, :] = _f32(0)
+    d_sh[i, :, :] = _f32(0)
+
+
+@njit(**_OPTIONS)
+def _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
+    total = np.float64(d_logits[i]) + d_screen[i, 0] + d_screen[i, 1]
+    for k in range(3):
+        total += np.float64(d_means[i, k]) + d_log_scales[i, k] + d_quaternions[i, k] + d_sh[i, 0, k]
+    return math.isfinite(total + d_quaternions[i, 3])
+
+
+@njit(parallel=True, **_OPTIONS)
+def project_backward(means, log_scales, quaternions, logits, sh, degree, view, record, rows, first_pair, used, partial,
+                     d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, overflown):  # fmt: skip
+    """Reduce the partial gradients [pairs, 16] of every chosen Gaussian and carry them to its parameters.
+
+    Rows that are not chosen or not drawn are zero; so are rows whose gradient overflows, and those are counted in
+    `overflown` [CHUNKS].
+    """
+    count = means.shape[0]
+    for chunk in prange(CHUNKS):
+        values, d_values, g = np.empty(16, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
+        bad = 0
+        for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
+            if rows[i] == 0 or not _sum_pairs(partial, used, first_pair[i], first_pair[i + 1], g):
+                _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i)
+                continue
+            x, y, z = _project_one_backward(means, log_scales, quaternions, logits, view, g, d_log_scales,
+                                            d_quaternions, d_logits, d_screen, i)  # fmt: skip
+            cx, cy, cz = _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i)
+            d_means[i, 0], d_means[i, 1], d_means[i, 2] = x + cx, y + cy, z + cz
+            if not _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
+                _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i)
+                bad += 1
+        overflown[chunk] = bad

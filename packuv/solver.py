@@ -1,0 +1,255 @@
+"""Iterations over the pictures of one instant: render, compare, step, and keep the number of Gaussians in hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from packuv.camera import PinholeCamera
+from packuv.density import DensityOptions, ScreenGradient, grow, opacity, prune, relocate
+from packuv.labels import LabelOptions
+from packuv.lift import LiftOptions
+from packuv.losses import PhotometricOptions, photometric_loss
+from packuv.model import ATTRIBUTES, Model, Rates, rows_of
+from packuv.quantize import Gaussians, Quantizer
+from packuv.raster import RasterOptions, Workspace, gradients, render
+from packuv.start import Bounds, StartOptions
+from packuv.uvmap import UvOptions
+
+Progress = Callable[[int, int], None]
+
+
+class Ticks:
+    """Counts work done and tells whoever asked."""
+
+    def __init__(self, progress: Progress | None, total: int, done: int = 0) -> None:
+        self._progress, self._total, self._done = progress, total, done
+
+    def advance(self) -> None:
+        self._done += 1
+        if self._progress:
+            self._progress(self._done, self._total)
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How long and how large; presets live in `pipelines.options`."""
+
+    iterations: int = 1500
+    """Of the first keyframe, one camera each"""
+    key_iterations: int = 500
+    """Of each later keyframe"""
+    frame_iterations: int = 60
+    """Of each frame inside a segment, at most"""
+    coarse_share: float = 0.4
+    """Share of the first keyframe's iterations on pictures of half the size"""
+    float_share: float = 0.7
+    """Share of the first keyframe's iterations before the quantizer is fixed"""
+    sh_degree: int = 0
+    """View dependence: 0 none, 1 to 3 as in 3D Gaussian Splatting"""
+    near_share: float = 0.12
+    """Near plane, in scene radii; cameras may sit in the wall they film"""
+    near_jitter: float = 0.0
+    """Share of the iterations that draw the near plane at random up to `near_reach`: what only hides close before one
+    camera cannot explain its picture then"""
+    near_reach: float = 0.6
+    """In scene radii"""
+    opacity_weight: float = 0.0
+    """Of mean alpha (1 - alpha), which makes Gaussians decide (paper, objective)"""
+    scale_weight: float = 0.0
+    """Of the squared excess of the longest standard deviation over `scale_limit`, in radii (paper, objective)"""
+    scale_limit: float = 0.1
+    """In scene radii"""
+    frame_rate_scale: float = 4.0
+    """Factor on the means' rate inside segments: the lifted motion is only nearly right"""
+    spare: int = 1500
+    """Rows per segment that are empty at its keyframe, for what comes into view"""
+    key_births: int = 4000
+    """Gaussians born inside the hull of what changed since the last keyframe"""
+    births_share: float = 0.05
+    """Of the moving rows, how many empty ones may come alive in one pass"""
+    settle: float = 0.003
+    """A frame stops when a pass over the cameras improves the loss by less than this share"""
+    seed: int = 0
+    start: StartOptions = field(default_factory=StartOptions)
+    density: DensityOptions = field(default_factory=DensityOptions)
+    rates: Rates = field(default_factory=Rates)
+    photometric: PhotometricOptions = field(default_factory=PhotometricOptions)
+    uv: UvOptions = field(default_factory=UvOptions)
+    labels: LabelOptions = field(default_factory=LabelOptions)
+    lift: LiftOptions = field(default_factory=LiftOptions)
+
+    def __post_init__(self) -> None:
+        if min(self.iterations, self.key_iterations, self.frame_iterations) < 1:
+            raise ValueError("a fit needs at least one iteration per keyframe and frame")
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"the SH degree must be 0 to 3, but is {self.sh_degree}")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture to explain."""
+
+    camera: PinholeCamera
+    target: np.ndarray
+    """float32 [3, H, W] in [0, 1]"""
+    tiles: np.ndarray | None = None
+    """bool [tiles_y, tiles_x] where the picture counts; None: everywhere"""
+
+
+def halved(shot: Shot) -> Shot:
+    """The same picture at half its size."""
+    camera = shot.camera.scaled(max(16, shot.camera.width // 2), max(16, shot.camera.height // 2))
+    small = cv2.resize(shot.target.transpose(1, 2, 0), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return Shot(camera, np.ascontiguousarray(small.transpose(2, 0, 1)))
+
+
+class Solver:
+    """Iterations over the pictures of one instant."""
+
+    def __init__(self, model: Model, bounds: Bounds, options: FitOptions, rng: np.random.Generator) -> None:
+        self.model = model
+        self.rows = np.ones(len(model), bool)
+        """Which Gaussians may change"""
+        self.gradient = ScreenGradient(len(model))
+        self._quantizer: Quantizer | None = None
+        self._drawn: Gaussians | None = None
+        self.bounds = bounds
+        self._options = options
+        self._rng = rng
+        self._order: list[int] = []
+        self._workspace = Workspace()
+        self.done = 0
+
+    @property
+    def known_quantizer(self) -> Quantizer:
+        if self._quantizer is None:
+            raise RuntimeError("the quantizer is fixed after the first iterations only")
+        return self._quantizer
+
+    def fix(self, quantizer: Quantizer) -> None:
+        """From now on render what the codes decode to."""
+        self._quantizer, self._drawn = quantizer, None
+
+    def free(self, rows: np.ndarray) -> None:
+        """Only these rows, bool [N], may change."""
+        self.rows = rows.copy()
+
+    def append(self, born: Gaussians) -> None:
+        """Add Gaussians that may change."""
+        self.model.append(born)
+        self.rows = np.concatenate([self.rows, np.ones(len(born), bool)])
+        self._start_afresh()
+
+    def keep(self, rows: np.ndarray) -> None:
+        self.model.keep(rows)
+        self.rows = self.rows[rows]
+        self._start_afresh()
+
+    def run(
+        self, shots: Sequence[Shot], count: int, *, of: int, dense: bool = False, ticks: Ticks | None = None
+    ) -> float:
+        """`count` iterations of `of`; `dense` also adds and prunes Gaussians. Returns the mean loss of the last pass."""
+        losses = []
+        self._order = []
+        for _ in range(count):
+            losses.append(self._iterate(shots, progress=self.done / of))
+            self.done += 1
+            if dense and self.done % self._options.density.every == 0 and self.done < of * self._options.density.until:
+                self._round(of)
+            if ticks:
+                ticks.advance()
+        return float(np.mean(losses[-len(shots) :])) if losses else 0.0
+
+    def settle(self, shots: Sequence[Shot], limit: int) -> tuple[float, int]:
+        """Passes over the cameras until the loss settles or `limit` iterations; returns the last mean loss and count.
+
+        Empty rows are used for what the pictures still lack after the first pass.
+        """
+        best, done, mean = np.inf, 0, np.inf
+        while done < limit:
+            count = min(len(shots), limit - done)
+            losses = [self._iterate(shots, progress=0.0, scale=self._options.frame_rate_scale) for _ in range(count)]
+            done, mean = done + count, float(np.mean(losses))
+            if done < limit * self._options.density.until:
+                relocate(self.model, self.gradient.mean, self.rows, bounds=self.bounds,
+                         options=self._options.density, share=self._options.births_share, rng=self._rng)  # fmt: skip
+                self._start_afresh()
+            elif mean > best * (1 - self._options.settle):
+                break
+            best = min(best, mean)
+        return mean, done
+
+    def _iterate(self, shots: Sequence[Shot], *, progress: float, scale: float = 1.0) -> float:
+        if not self._order:
+            self._order = list(self._rng.permutation(len(shots)))
+        shot = shots[self._order.pop()]
+        options, drawn = self._options, self._decoded()
+        rendering = render(drawn, shot.camera, options=RasterOptions(self._near()), tiles=shot.tiles,
+                           workspace=self._workspace)  # fmt: skip
+        loss = photometric_loss(rendering.colour, shot.target, options=options.photometric, tiles=shot.tiles)
+        if not np.isfinite(loss.value):
+            raise ValueError(f"the loss of camera {shot.camera.name!r} is {loss.value} in iteration {self.done}: its "
+                             "picture or the Gaussians hold values that are not finite")  # fmt: skip
+        found = gradients(rendering, loss.gradient, rows=self.rows)
+        self.gradient.add(found.means2d, rendering.visible, shot.camera.width, shot.camera.height)
+        moving = self.rows & (rendering.visible > 0)
+        values = {name: getattr(found, name) for name in ATTRIBUTES}
+        self._regularise(values, moving)
+        self.model.step(values, options.rates, radius=self.bounds.radius * scale, progress=progress, rows=moving)
+        return loss.value
+
+    def _decoded(self) -> Gaussians:
+        """What the renderer draws; only rows that may change are decoded again."""
+        if self._quantizer is None:
+            return self.model.gaussians
+        if self._drawn is None:
+            self._drawn = self._quantizer.decode(self._quantizer.encode(self.model.gaussians))
+        else:
+            rows = np.flatnonzero(self.rows)
+            fresh = self._quantizer.decode(self._quantizer.encode(rows_of(self.model.gaussians, rows)))
+            for name in ATTRIBUTES:
+                getattr(self._drawn, name)[rows] = getattr(fresh, name)
+        return self._drawn
+
+    def _near(self) -> float:
+        options, near = self._options, self.bounds.near
+        if options.near_jitter and self._rng.random() < options.near_jitter:
+            return float(self._rng.uniform(near, max(near, options.near_reach * self.bounds.radius)))
+        return near
+
+    def _regularise(self, values: dict[str, np.ndarray], rows: np.ndarray) -> None:
+        """Add the gradients of the opacity and scale terms, means over the rows that may change."""
+        options, g, count = self._options, self.model.gaussians, max(1, int(rows.sum()))
+        if options.opacity_weight:
+            alpha = opacity(g)
+            slope = alpha * (1 - alpha) * (1 - 2 * alpha) * (options.opacity_weight / count)
+            values["opacity_logits"] = values["opacity_logits"] + (slope * rows).astype(np.float32)
+        if options.scale_weight:
+            axis = g.log_scales.argmax(axis=1)[:, None]
+            longest = np.exp(np.take_along_axis(g.log_scales, axis, 1)) / self.bounds.radius
+            excess = np.maximum(longest - options.scale_limit, 0) * rows[:, None]
+            pull = np.zeros_like(g.log_scales)
+            np.put_along_axis(pull, axis, (2 * options.scale_weight / count * excess * longest).astype(np.float32), 1)
+            values["log_scales"] = values["log_scales"] + pull
+
+    def _round(self, of: int) -> None:
+        """Prune, then grow towards the cap."""
+        options = self._options.density
+        kept = ~self.rows | prune(self.model, self.gradient, bounds=self.bounds, options=options, uv=self._options.uv)
+        score = np.where(self.rows & kept & (self.gradient.seen > 0), self.gradient.mean, 0)[kept]
+        self.keep(kept)
+        share = min(1.0, self.done / (of * options.until))
+        target = round(self._options.start.count + (options.cap - self._options.start.count) * share)
+        count = max(0, min(target, options.cap) - len(self.model))
+        before = len(self.model)
+        grow(self.model, score, count, bounds=self.bounds, options=options, rng=self._rng)
+        self.rows = np.concatenate([self.rows, np.ones(len(self.model) - before, bool)])
+        self._start_afresh()
+
+    def _start_afresh(self) -> None:
+        self.gradient = ScreenGradient(len(self.model))
+        self._drawn = None

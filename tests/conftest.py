@@ -1,0 +1,58 @@
+"""What tests share: the real captures, where they are, and one workflow server per session."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Folder with recorded captures; tests that need them skip where it is absent."""
+    default = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
+    folder = Path(os.environ.get("PACKUV_DATA", default)).resolve()
+    if not folder.is_dir():
+        pytest.skip(f"no recorded captures at {folder}; set PACKUV_DATA")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def workflow(tmp_path_factory: pytest.TempPathFactory):
+    """The embedded workflow server, started once; flows of the test process use it."""
+    from pipelines.server import workflow_server
+
+    with workflow_server(tmp_path_factory.mktemp("workflow")) as server:
+        # Another test module may have imported Prefect, which then has read its settings already.
+        from prefect.settings import PREFECT_API_URL, PREFECT_LOGGING_LEVEL, temporary_settings
+
+        server.wait_ready()
+        with temporary_settings({PREFECT_API_URL: server.address, PREFECT_LOGGING_LEVEL: "CRITICAL"}):
+            yield server
+
+
+@pytest.fixture(scope="session")
+def ring():
+    """Builds cameras that look at a point from a circle: ring(6, width=64) -> list of PinholeCamera."""
+    import numpy as np
+
+    from packuv.camera import PinholeCamera
+
+    def build(count: int, *, width: int = 96, height: int = 64, radius: float = 4.0, centre=(0.0, 0.0, 0.0)):
+        cameras = []
+        for index in range(count):
+            angle = 2 * np.pi * index / count
+            origin = np.asarray(centre) + radius * np.array([np.cos(angle), np.sin(angle), 0.35 * (-1) ** index])
+            forward = (np.asarray(centre) - origin) / np.linalg.norm(np.asarray(centre) - origin)
+            right = np.cross(forward, [0, 0, 1.0])
+            right /= np.linalg.norm(right)
+            rotation = np.stack([right, np.cross(forward, right), forward])
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = rotation, -rotation @ origin
+            cameras.append(
+                PinholeCamera(f"cam{index}", width, height, width * 1.1, width * 1.1, width / 2, height / 2, pose)
+            )
+        return cameras
+
+    return build

@@ -1,0 +1,519 @@
+"""The CPU rasterizer against a dense float64 reference, and what it promises besides: determinism, tiles, rows."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from packuv.camera import PinholeCamera
+from packuv.quantize import Gaussians
+from packuv.raster import RasterOptions, Workspace, gradients, render, tile_shape
+from packuv.raster.cpu import Rendering, backward, forward
+from packuv.raster.simd import LANES_8, LANES_16
+
+OPTIONS = RasterOptions(near=0.05)
+BACKGROUND = (0.2, 0.5, 0.9)
+FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+
+IMAGE_TOLERANCE = 1e-5
+"""Float32 sums of some hundred terms below 1; measured 2.5e-6."""
+GRADIENT_TOLERANCE = 2e-5
+"""Relative, per array; measured 6e-6."""
+OCCLUDED_IMAGE_TOLERANCE = 2e-4
+"""Blending ends at a transmittance of 1e-4, the reference never ends."""
+OCCLUDED_GRADIENT_TOLERANCE = 2e-3
+"""The same cause; measured 3e-4."""
+
+
+# -- the reference: every Gaussian at every pixel, no tiles, no termination --------------------------------------------
+
+
+def sh_colour(degree: int, sh: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+    x, y, z = direction.unbind(-1)
+    values = [torch.full_like(x, 0.28209479177387814)]
+    if degree > 0:
+        values += [0.4886025119029199 * v for v in (-y, z, -x)]
+    if degree > 1:
+        values += [1.0925484305920792 * x * y, -1.0925484305920792 * y * z]
+        values += [0.31539156525252005 * (2 * z * z - x * x - y * y)]
+        values += [-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)]
+    if degree > 2:
+        values += [-0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z]
+        values += [-0.4570457994644658 * y * (4 * z * z - x * x - y * y)]
+        values += [0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y)]
+        values += [-0.4570457994644658 * x * (4 * z * z - x * x - y * y)]
+        values += [1.445305721320277 * z * (x * x - y * y), -0.5900435899266435 * x * (x * x - 3 * y * y)]
+    basis = torch.stack(values, -1)
+    return (torch.einsum("nk,nkc->nc", basis, sh[:, : basis.shape[1]]) + 0.5).clamp_min(0)
+
+
+def rotation_matrices(quaternions: torch.Tensor) -> torch.Tensor:
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return torch.stack(rows, -1).view(-1, 3, 3)
+
+
+def clamped_slope(slope, centre, focal, size):
+    """The local linear map is taken at most 15 % of the picture beyond its edge."""
+    return slope.clamp(-(centre + 0.15 * size) / focal, (size - centre + 0.15 * size) / focal)
+
+
+def ellipses(means, log_scales, quaternions, camera, options):
+    """Centres in the picture [N, 2], inverse covariances [N, 2, 2], depth [N]."""
+    pose = torch.from_numpy(camera.camera_from_world)
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+    slopes = []
+    for slope, centre, focal, size in (
+        (x / z, camera.cx, camera.fx, camera.width),
+        (y / z, camera.cy, camera.fy, camera.height),
+    ):
+        slopes.append(slope.clamp(-(centre + 0.15 * size) / focal, (size - centre + 0.15 * size) / focal))
+    o = torch.zeros_like(x)
+    rows = [camera.fx / z, o, -camera.fx * slopes[0] / z, o, camera.fy / z, -camera.fy * slopes[1] / z]
+    jacobian = torch.stack(rows, -1).view(-1, 2, 3)
+    axes = jacobian @ pose[:3, :3] @ (rotation_matrices(quaternions) * log_scales.exp()[:, None, :])
+    covariance = axes @ axes.transpose(1, 2) + options.low_pass_px2 * torch.eye(2, dtype=torch.float64)
+    centre = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+    return centre, torch.linalg.inv(covariance), z
+
+
+def reference(fields, camera, degree, options=OPTIONS, background=BACKGROUND, shift=0.0):
+    """Colour [3, H, W], depth [H, W], alpha [H, W], weights [N], float64; differentiable.
+
+    `shift` [N, 2] moves the centres in the picture.
+    """
+    means, log_scales, quaternions, logits, sh = fields
+    centre, conic, z = ellipses(means, log_scales, quaternions, camera, options)
+    centre = centre + shift
+    eye = torch.from_numpy(camera.centre)
+    colour = sh_colour(degree, sh, torch.nn.functional.normalize(means - eye, dim=-1))
+    drawn = torch.nonzero(z >= options.near)[:, 0]
+    order = drawn[torch.argsort(z[drawn], stable=True)]
+    ys, xs = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    offset = torch.stack([xs, ys], -1).double().view(1, -1, 2) - centre[order][:, None]
+    power = torch.einsum("npi,nij,npj->np", offset, conic[order], offset)
+    raw = torch.sigmoid(logits[order])[:, None] * torch.exp(-0.5 * power)
+    alpha = torch.where(raw >= 1 / 255, raw.clamp_max(0.99), 0)
+    after = torch.cumprod(1 - alpha, 0)
+    weight = alpha * torch.cat([torch.ones_like(after[:1]), after[:-1]], 0)
+    behind = torch.tensor(background, dtype=torch.float64)
+    picture = torch.einsum("np,nc->cp", weight, colour[order]) + after[-1] * behind[:, None]
+    shape = (camera.height, camera.width)
+    sums = torch.zeros_like(z).index_put((order,), weight.sum(1))
+    return picture.view(3, *shape), (weight * z[order][:, None]).sum(0).view(shape), (1 - after[-1]).view(shape), sums
+
+
+# -- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def camera(width: int = 70, height: int = 50) -> PinholeCamera:
+    """Turned by 0.2 rad, four units from the origin."""
+    c, s = np.cos(0.2), np.sin(0.2)
+    pose = np.array([[c, 0, s, 0.1], [0, 1, 0, -0.05], [-s, 0, c, 4.0], [0, 0, 0, 1.0]])
+    return PinholeCamera("test", width, height, 0.9 * width, 0.92 * width, width / 2 + 1.3, height / 2 - 0.7, pose)
+
+
+def scene(count: int, *, seed: int = 0, size: float = 1.0, spread: float = 1.0, degree: int = 3) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    sh = rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.25
+    sh[:, 0] *= 3
+    arrays = (
+        rng.normal(size=(count, 3)) * (1.2, 0.9, 1.0),
+        -2.6 + 0.5 * spread * rng.normal(size=(count, 3)) + np.log(size),
+        rng.normal(size=(count, 4)),
+        rng.normal(size=count) * 1.5,
+        sh,
+    )
+    return Gaussians(*(a.astype(np.float32) for a in arrays))
+
+
+def fields64(gaussians: Gaussians) -> list[torch.Tensor]:
+    return [torch.from_numpy(getattr(gaussians, name)).double().requires_grad_() for name in FIELDS]
+
+
+def upstream(view: PinholeCamera, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Random derivatives of some scalar by colour, depth and alpha."""
+    rng, shape = np.random.default_rng(seed), (view.height, view.width)
+    return tuple(rng.normal(size=s).astype(np.float32) for s in ((3, *shape), shape, shape))
+
+
+def relative(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(found - truth) / max(np.linalg.norm(truth), 1e-30))
+
+
+def changed(gaussians: Gaussians, name: str, row: int, value: object) -> Gaussians:
+    array = getattr(gaussians, name).copy()
+    array[row] = value
+    return dataclasses.replace(gaussians, **{name: array})
+
+
+def same_bytes(a: Rendering, b: Rendering) -> bool:
+    return all(getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in ("colour", "depth", "alpha"))
+
+
+def assert_matches_reference(gaussians, view, degree, image_tolerance, gradient_tolerance, lanes=None, options=OPTIONS):
+    d_colour, d_depth, d_alpha = upstream(view)
+    fields = fields64(gaussians)
+    truth = reference(fields, view, degree, options)
+    scalar = sum((p * torch.from_numpy(d)).sum() for p, d in zip(truth, (d_colour, d_depth, d_alpha), strict=False))
+    expected = torch.autograd.grad(scalar, fields)
+    found = forward(
+        gaussians, view, options=options, sh_degree=degree, background=BACKGROUND, weights=True, lanes=lanes
+    )
+    depth_scale = max(1.0, float(truth[1].abs().max()))
+    assert np.abs(found.colour - truth[0].detach().numpy()).max() < image_tolerance
+    assert np.abs(found.depth - truth[1].detach().numpy()).max() < image_tolerance * depth_scale
+    assert np.abs(found.alpha - truth[2].detach().numpy()).max() < image_tolerance
+    assert relative(found.weights, truth[3].detach().numpy()) < gradient_tolerance
+    result = backward(found, d_colour, d_depth, d_alpha)
+    for name, value in zip(FIELDS, expected, strict=True):
+        assert relative(getattr(result, name), value.numpy()) < gradient_tolerance, name
+    assert result.overflow_count == found.invalid_count == 0
+
+
+# -- correctness ------------------------------------------------------------------------------------------------------
+
+WIDTHS = pytest.mark.parametrize("lanes", [LANES_8, LANES_16], ids=["8 lanes", "16 lanes"])
+
+
+@WIDTHS
+@pytest.mark.parametrize(
+    ("count", "width", "height", "degree", "size", "spread"),
+    [
+        (60, 40, 37, 3, 1, 1),
+        (300, 70, 50, 2, 1, 1),
+        (500, 64, 64, 3, 0.4, 2),
+        (300, 61, 48, 1, 1, 1),
+        (9, 3, 2, 0, 3, 1),
+    ],
+)
+def test_matches_the_dense_reference(lanes, count, width, height, degree, size, spread):
+    gaussians = scene(count, seed=count, size=size, spread=spread)
+    view = camera(width, height)
+    assert_matches_reference(gaussians, view, degree, IMAGE_TOLERANCE, GRADIENT_TOLERANCE, lanes)
+
+
+@WIDTHS
+def test_matches_under_heavy_occlusion(lanes):
+    gaussians = scene(800, seed=5, size=2.5)
+    assert_matches_reference(gaussians, camera(96, 64), 0, OCCLUDED_IMAGE_TOLERANCE, OCCLUDED_GRADIENT_TOLERANCE, lanes)
+
+
+@WIDTHS
+def test_matches_on_needles_discs_and_ellipses_beyond_the_picture(lanes):
+    gaussians = scene(200, seed=3)
+    gaussians.log_scales[:60] = (-0.5, -7.0, -7.0)
+    gaussians.log_scales[60:120] = (-1.5, -1.5, -9.0)
+    gaussians.means[::3, 0] *= 2.5  # partly or wholly outside, where the linear map is clamped
+    assert_matches_reference(gaussians, camera(64, 50), 1, IMAGE_TOLERANCE, GRADIENT_TOLERANCE, lanes)
+
+
+def test_coefficients_above_the_rendered_degree_get_no_gradient():
+    gaussians, view = scene(50), camera()
+    result = backward(forward(gaussians, view, options=OPTIONS, sh_degree=1), upstream(view)[0])
+    assert np.any(result.sh[:, :4])
+    assert not result.sh[:, 4:].any()
+
+
+def test_gradient_of_the_position_in_the_picture():
+    gaussians, view = scene(80, size=0.7, degree=0), camera()
+    d_colour = upstream(view)[0]
+    shift = torch.zeros(80, 2, dtype=torch.float64, requires_grad=True)
+    picture = reference(fields64(gaussians), view, 0, shift=shift)[0]
+    (expected,) = torch.autograd.grad((picture * torch.from_numpy(d_colour)).sum(), shift)
+    found = backward(forward(gaussians, view, options=OPTIONS, background=BACKGROUND), d_colour)
+    assert relative(found.means2d, expected.numpy()) < GRADIENT_TOLERANCE
+
+
+def test_near_plane_hides_what_is_nearer():
+    gaussians, view = scene(100, seed=8), camera()
+    depth = view.project(gaussians.means)[1]
+    near = float(np.median(depth))
+    assert_matches_reference(gaussians, view, 3, IMAGE_TOLERANCE, GRADIENT_TOLERANCE, options=RasterOptions(near=near))
+    rendering = forward(gaussians, view, options=RasterOptions(near=near))
+    assert not rendering.visible[depth < near].any()
+
+
+def test_no_gaussians_show_the_background():
+    view = camera()
+    rendering = forward(scene(0), view, options=OPTIONS, background=BACKGROUND)
+    assert np.array_equal(rendering.colour, np.broadcast_to(np.float32(BACKGROUND)[:, None, None], (3, 50, 70)))
+    assert not rendering.alpha.any()
+    assert not rendering.depth.any()
+    assert backward(rendering, upstream(view)[0]).means.shape == (0, 3)
+
+
+# -- degenerate input -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("means", np.nan),
+        ("means", (0, np.inf, 0)),
+        ("means", 1e30),
+        ("log_scales", np.nan),
+        ("log_scales", -np.inf),
+        ("log_scales", (90.0, 0, 0)),
+        ("quaternions", 0.0),
+        ("quaternions", 1e-20),
+        ("quaternions", np.nan),
+        ("opacity_logits", np.nan),
+        ("opacity_logits", np.inf),
+        ("sh", np.nan),
+        ("sh", 1e30),
+    ],
+)
+def test_invalid_gaussian_is_skipped_and_counted(name, value):
+    view, row = camera(), 7
+    gaussians = scene(40)
+    gaussians.means[row] = 0
+    broken = forward(changed(gaussians, name, row, value), view, options=OPTIONS)
+    assert broken.invalid_count == 1
+    assert same_bytes(broken, forward(changed(gaussians, "opacity_logits", row, -20.0), view, options=OPTIONS))
+    result = backward(broken, *upstream(view))
+    for field in (*FIELDS, "means2d"):
+        assert np.isfinite(getattr(result, field)).all()
+        assert not getattr(result, field)[row].any()
+
+
+def extreme_scene() -> Gaussians:
+    """Huge and tiny, behind, on and just before the camera plane, saturated, far away: all valid."""
+    gaussians = scene(240, seed=4)
+    view = camera()
+    groups = np.array_split(np.arange(240), 8)
+    gaussians.log_scales[groups[0]] = 20.0
+    gaussians.log_scales[groups[1]] = -60.0
+    gaussians.log_scales[groups[2]] = (12.0, -30.0, -30.0)
+    plane = view.centre + np.random.default_rng(0).normal(size=(len(groups[3]), 3)) @ np.diag([1, 1, 0])
+    gaussians.means[groups[3]] = plane + view.forward * 1e-7
+    gaussians.means[groups[4]] = view.centre - view.forward
+    gaussians.opacity_logits[groups[5]] = 80.0
+    gaussians.opacity_logits[groups[6]] = -80.0
+    gaussians.means[groups[7]] *= 1e6
+    gaussians.quaternions[::2] *= 1e-6
+    gaussians.quaternions[1::2] *= 1e6
+    return gaussians
+
+
+@pytest.mark.parametrize("near", [0.05, 1e-9])
+def test_extreme_gaussians_leave_everything_finite(near):
+    view = camera()
+    rendering = forward(extreme_scene(), view, options=RasterOptions(near=near), weights=True)
+    result = backward(rendering, *upstream(view))
+    assert rendering.invalid_count == 0
+    for picture in (rendering.colour, rendering.depth, rendering.alpha, rendering.weights):
+        assert np.isfinite(picture).all()
+    assert rendering.alpha.min() >= 0
+    assert rendering.alpha.max() <= 1
+    for field in (*FIELDS, "means2d"):
+        assert np.isfinite(getattr(result, field)).all(), field
+
+
+def test_overflowing_gradients_are_zero_and_counted():
+    gaussians, view = scene(40, seed=2), camera()
+    rendering = forward(gaussians, view, options=OPTIONS)
+    result = backward(rendering, np.full((3, 50, 70), 3e38, np.float32))
+    assert result.overflow_count > 0
+    for field in (*FIELDS, "means2d"):
+        assert np.isfinite(getattr(result, field)).all()
+
+
+def test_a_sub_pixel_gaussian_is_still_seen():
+    gaussians = changed(scene(1), "log_scales", 0, -30.0)
+    gaussians.means[0] = 0
+    gaussians.opacity_logits[0] = 5.0
+    assert forward(gaussians, camera(), options=OPTIONS).alpha.max() > 0.5
+
+
+# -- tiles and rows ---------------------------------------------------------------------------------------------------
+
+
+def pixels(tiles: np.ndarray, view: PinholeCamera) -> np.ndarray:
+    return np.kron(tiles, np.ones((16, 16), bool))[: view.height, : view.width]
+
+
+def test_active_tiles_are_those_of_the_whole_picture_and_the_rest_is_background():
+    gaussians, view = scene(300, seed=6), camera(100, 70)
+    tiles = np.random.default_rng(0).random(tile_shape(view)) < 0.4
+    mask = pixels(tiles, view)
+    whole = forward(gaussians, view, options=OPTIONS, background=BACKGROUND)
+    part = forward(gaussians, view, options=OPTIONS, background=BACKGROUND, tiles=tiles)
+    assert np.array_equal(part.colour[:, mask], whole.colour[:, mask])
+    assert np.array_equal(part.depth, np.where(mask, whole.depth, 0))
+    assert np.array_equal(part.alpha, np.where(mask, whole.alpha, 0))
+    assert np.array_equal(part.colour[:, ~mask], np.broadcast_to(np.float32(BACKGROUND)[:, None], (3, (~mask).sum())))
+    assert (part.visible <= whole.visible).all()
+
+
+def test_gradients_of_active_tiles_are_those_of_a_masked_loss():
+    gaussians, view = scene(300, seed=6), camera(100, 70)
+    tiles = np.random.default_rng(1).random(tile_shape(view)) < 0.4
+    mask = pixels(tiles, view)
+    d = upstream(view)
+    whole = backward(forward(gaussians, view, options=OPTIONS), *(g * mask for g in d))
+    part = backward(forward(gaussians, view, options=OPTIONS, tiles=tiles), *d)
+    for field in (*FIELDS, "means2d"):
+        # Tiles without gradient add zeros, so even the bits agree.
+        assert np.array_equal(getattr(part, field), getattr(whole, field)), field
+
+
+def test_no_active_tile_costs_nothing():
+    gaussians, view = scene(50), camera()
+    rendering = forward(gaussians, view, options=OPTIONS, tiles=np.zeros(tile_shape(view), bool))
+    assert rendering.pair_count == rendering.evaluation_count == 0
+    assert not rendering.alpha.any()
+
+
+def test_work_falls_with_the_share_of_active_tiles():
+    gaussians, view = scene(2000, seed=1, size=0.3), camera(320, 240)
+    half = np.zeros(tile_shape(view), bool)
+    half[:, : half.shape[1] // 2] = True
+    other = ~half
+    counts = [forward(gaussians, view, options=OPTIONS, tiles=t).evaluation_count for t in (half, other, half | other)]
+    assert counts[0] + counts[1] == counts[2]
+
+
+def test_chosen_rows_have_the_gradients_of_all_and_the_rest_has_none():
+    gaussians, view = scene(300, seed=9, size=1.5), camera(100, 70)
+    rows = np.random.default_rng(2).random(300) < 0.15
+    rendering = forward(gaussians, view, options=OPTIONS)
+    whole, part = backward(rendering, *upstream(view)), backward(rendering, *upstream(view), rows=rows)
+    for field in (*FIELDS, "means2d"):
+        assert np.array_equal(getattr(part, field)[rows], getattr(whole, field)[rows]), field
+        assert not getattr(part, field)[~rows].any()
+
+
+def test_no_chosen_row():
+    gaussians, view = scene(40), camera()
+    result = backward(forward(gaussians, view, options=OPTIONS), *upstream(view), rows=np.zeros(40, bool))
+    assert not any(getattr(result, field).any() for field in FIELDS)
+
+
+# -- promises ---------------------------------------------------------------------------------------------------------
+
+DIGEST = """
+import hashlib, numba, sys
+sys.path.insert(0, {folder!r})
+import test_packuv_raster as t
+numba.set_num_threads(min({threads}, numba.config.NUMBA_NUM_THREADS))
+view, g = t.camera(160, 120), t.scene(1500, seed=3)
+r = t.forward(g, view, options=t.OPTIONS, weights=True)
+d = t.backward(r, *t.upstream(view))
+arrays = [r.colour, r.depth, r.alpha, r.visible, r.weights] + [getattr(d, f) for f in (*t.FIELDS, "means2d")]
+print(hashlib.sha256(b"".join(a.tobytes() for a in arrays)).hexdigest())
+"""
+
+
+def digest(threads: int) -> str:
+    code = DIGEST.format(folder=str(Path(__file__).parent), threads=threads)
+    environment = {**os.environ, "NUMBA_NUM_THREADS": str(max(threads, 2))}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    return run.stdout.strip()
+
+
+def test_bytes_depend_neither_on_the_run_nor_on_the_threads():
+    assert len({digest(1), digest(2), digest(3)}) == 1
+
+
+def test_a_rendering_stays_valid_while_others_are_made():
+    gaussians, view, workspace = scene(200), camera(), Workspace()
+    first = forward(gaussians, view, options=OPTIONS, workspace=workspace)
+    colour, expected = first.colour.copy(), backward(first, *upstream(view)).means.copy()
+    for seed in range(3):
+        other = forward(scene(300, seed=seed), view, options=OPTIONS, workspace=workspace)
+        backward(other, *upstream(view))
+    assert np.array_equal(first.colour, colour)
+    assert np.array_equal(backward(first, *upstream(view)).means, expected)
+
+
+def test_a_picture_outlives_its_rendering():
+    gaussians, view, workspace = scene(200), camera(), Workspace()
+    colour = forward(gaussians, view, options=OPTIONS, workspace=workspace).colour
+    row, copy = colour[1, 10:20], colour.copy()
+    for seed in range(3):
+        forward(scene(200, seed=seed), view, options=OPTIONS, workspace=workspace)
+    assert np.array_equal(colour, copy)
+    assert np.array_equal(row, copy[1, 10:20])
+
+
+def test_a_workspace_stops_growing():
+    view, workspace = camera(), Workspace()
+    sizes = []
+    for step in range(12):
+        rendering = forward(scene(200 + 40 * (step % 3)), view, options=OPTIONS, workspace=workspace, weights=True)
+        backward(rendering, *upstream(view))
+        del rendering
+        sizes.append(workspace.free_bytes)
+    assert sizes[5] == sizes[-1]
+
+
+def test_threads_are_left_as_they_were():
+    before = numba.get_num_threads()
+    forward(scene(10), camera(), options=OPTIONS)
+    assert numba.get_num_threads() == before
+
+
+def test_render_and_gradients_take_the_cpu_path_for_arrays():
+    gaussians, view = scene(60), camera()
+    rendering = render(gaussians, view, options=OPTIONS)
+    assert same_bytes(rendering, forward(gaussians, view, options=OPTIONS))
+    found = gradients(rendering, upstream(view)[0])
+    assert np.array_equal(found.sh, backward(rendering, upstream(view)[0]).sh)
+
+
+# -- wrong input ------------------------------------------------------------------------------------------------------
+
+
+def test_wrong_input_is_refused_with_what_came():
+    gaussians, view = scene(5), camera()
+    with pytest.raises(ValueError, match=r"means must be C-contiguous float32 \(5, 3\), but is float64"):
+        forward(dataclasses.replace(gaussians, means=gaussians.means.astype(np.float64)), view, options=OPTIONS)
+    with pytest.raises(ValueError, match=r"tiles must be bool \(4, 5\)"):
+        forward(gaussians, view, options=OPTIONS, tiles=np.ones((5, 4), bool))
+    with pytest.raises(ValueError, match="SH degree 4"):
+        forward(gaussians, view, options=OPTIONS, sh_degree=4)
+    with pytest.raises(ValueError, match="must be positive"):
+        RasterOptions(near=0.0)
+    rendering = forward(gaussians, view, options=OPTIONS)
+    with pytest.raises(ValueError, match=r"rows must be bool \(5,\)"):
+        backward(rendering, *upstream(view), rows=np.ones(4, bool))
+    with pytest.raises(ValueError, match="must have its shape"):
+        backward(rendering, np.zeros((3, 5, 5), np.float32))
+    tensors = Gaussians(*(torch.from_numpy(getattr(gaussians, name)) for name in FIELDS))
+    with pytest.raises(ValueError, match="must be numpy arrays"):
+        render(tensors, view, options=OPTIONS)
+
+
+# -- the GPU ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_gsplat_agrees_with_the_cpu():
+    """Skipped at home; where a GPU is, gsplat must be there too."""
+    gaussians, view = scene(300, seed=11), camera()
+    gaussians.opacity_logits[:] = np.minimum(gaussians.opacity_logits, 3.0)  # below every version's cap on alpha
+    d = upstream(view)
+    rows = np.random.default_rng(0).random(300) < 0.5
+    host = render(gaussians, view, options=OPTIONS, background=BACKGROUND, weights=True)
+    device = Gaussians(*(torch.from_numpy(getattr(gaussians, name)).cuda() for name in FIELDS))
+    there = render(device, view, options=OPTIONS, background=BACKGROUND, weights=True)
+    for name in ("colour", "depth", "alpha", "weights"):
+        truth = getattr(host, name)
+        found = getattr(there, name).detach().cpu().numpy()
+        assert np.abs(found - truth).max() < 2e-4 * max(1.0, np.abs(truth).max()), name
+    here = gradients(host, *d, rows=rows)
+    over = gradients(there, *(torch.from_numpy(g).cuda() for g in d), rows=torch.from_numpy(rows).cuda())
+    for name in (*FIELDS, "means2d"):
+        # 1e-3: gsplat works in float32 throughout, and its bounding boxes may drop the faintest rim.
+        assert relative(getattr(over, name).cpu().numpy(), getattr(here, name)) < 1e-3, name
