@@ -1,0 +1,156 @@
+"""A local web server for one scene: the page, and the scene's integers on demand.
+
+Only the standard library; nothing is fetched from elsewhere, plain http suffices, and the page may not load anything
+from another origin.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import threading
+import webbrowser
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from functools import lru_cache
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from packuv.viewer.source import Source, describe, frame_bytes, key_bytes, open_source, tables_bytes
+
+PAGES = {
+    "/": ("page.html", "text/html; charset=utf-8"),
+    "/viewer.js": ("viewer.js", "text/javascript; charset=utf-8"),
+    "/splats.js": ("splats.js", "text/javascript; charset=utf-8"),
+    "/navigation.js": ("navigation.js", "text/javascript; charset=utf-8"),
+    "/worker.js": ("worker.js", "text/javascript; charset=utf-8"),
+}
+"""Path to file beside this module and its type; nothing else on disk is reachable"""
+
+BINARY = "application/octet-stream"
+NUMBERED = re.compile(r"/(segments|frames)/(0|[1-9][0-9]{0,8})\.bin")
+
+POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
+"""Content security policy: a page that tries to reach another origin fails at once"""
+
+LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+
+
+def serve(
+    scene_path: Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    open_browser: bool = False,
+    announce: Callable[[str], object] | None = None,
+) -> None:
+    """Show a scene file in the browser until interrupted.
+
+    Port 0 takes any free port. `announce` gets the address once it answers; by default it is printed. Raises
+    FileNotFoundError for a missing file, ValueError for one that is no scene, OSError where the port is taken.
+    """
+    with open_source(scene_path) as source, ViewerServer((host, port), source) as server:
+        announce(server.url) if announce else print(server.url, flush=True)
+        if open_browser:
+            webbrowser.open(server.url)
+        with suppress(KeyboardInterrupt):
+            server.serve_forever()
+
+
+class ViewerServer(ThreadingHTTPServer):
+    """Serves one source; the address is bound once constructed, `serve_forever` answers."""
+
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], source: Source) -> None:
+        super().__init__(address, _Handler)
+        self.source = source
+        self.reading = threading.Lock()  # decoders keep state
+        self.tables = lru_cache(maxsize=1)(lambda: tables_bytes(source.quantizer))
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A page that seeks or closes drops its requests; that is no news."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+    @property
+    def url(self) -> str:
+        host, port = self.server_address[:2]
+        return f"http://{host!s}:{port}/"
+
+    @property
+    def is_loopback(self) -> bool:
+        return self.server_address[0] in ("127.0.0.1", "::1")
+
+    def content(self, path: str) -> tuple[bytes, str] | None:
+        """Body and type of a path without its query; None where there is nothing."""
+        if path in PAGES:
+            name, kind = PAGES[path]
+            return Path(__file__).with_name(name).read_bytes(), kind
+        if path == "/scene.json":
+            return json.dumps(describe(self.source)).encode(), "application/json"
+        if path == "/tables.bin":
+            return self.tables(), BINARY
+        numbered = NUMBERED.fullmatch(path)
+        return self._numbered(numbered[1], int(numbered[2])) if numbered else None
+
+    def _numbered(self, what: str, number: int) -> tuple[bytes, str] | None:
+        build = key_bytes if what == "segments" else frame_bytes
+        try:
+            with self.reading:
+                return build(self.source, number), BINARY
+        except IndexError:
+            return None
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: ViewerServer
+    protocol_version = "HTTP/1.1"
+    server_version = "packuv"
+
+    def do_GET(self) -> None:
+        self._answer(with_body=True)
+
+    def do_HEAD(self) -> None:
+        self._answer(with_body=False)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Silent: the terminal belongs to the command that serves."""
+
+    def _answer(self, *, with_body: bool) -> None:
+        if self._is_rebound():
+            return self._send(HTTPStatus.FORBIDDEN, b"this viewer answers to localhost only\n", "text/plain", with_body)
+        path = self.path.partition("?")[0]
+        try:
+            found = self.server.content(path)
+        except Exception as error:  # a damaged file must reach the page as words, not as a dropped connection
+            message = f"{path}: {error}\n".encode()
+            return self._send(HTTPStatus.INTERNAL_SERVER_ERROR, message, "text/plain; charset=utf-8", with_body)
+        if found is None:
+            return self._send(HTTPStatus.NOT_FOUND, b"nothing here\n", "text/plain; charset=utf-8", with_body)
+        self._send(HTTPStatus.OK, *found, with_body)
+
+    def _is_rebound(self) -> bool:
+        """True if a name of another site was made to point here: its page must not read the scene."""
+        host = re.sub(r":\d+$", "", self.headers.get("Host", "localhost"))
+        return self.server.is_loopback and host not in LOOPBACK
+
+    def _send(self, status: HTTPStatus, body: bytes, kind: str, with_body: bool) -> None:
+        deflate = "deflate" in self.headers.get("Accept-Encoding", "")
+        if deflate:
+            body = zlib.compress(body, 1)
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        if deflate:
+            self.send_header("Content-Encoding", "deflate")
+        self.send_header("Vary", "Accept-Encoding")
+        self.send_header("Cache-Control", "no-cache")
+        self.send_header("Content-Security-Policy", POLICY)
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        if with_body:
+            self.wfile.write(body)

@@ -1,0 +1,238 @@
+"""What the viewer shows, and the bytes it sends for it.
+
+Integers travel, never floats made on the way: a keyframe as all its codes, every other frame as the difference of
+its dynamic rows to the keyframe, modulo the width of the code. The page adds them up and looks the values up in the
+quantizer's own tables, so that it draws from the very float32 values that the fit rendered. docs/viewer.md gives the
+layout byte by byte.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from packuv.camera import PinholeCamera
+from packuv.quantize import Codes, Quantizer, attribute_count
+from packuv.scene import Scene, open_scene
+from packuv.segment import Segment
+
+NEAR_SHARE = 0.02
+"""Near plane as a share of the cameras' median distance from their centre, where the scene names none"""
+
+CACHE_BYTES = 64 << 20
+"""Dynamic rows that a scene file keeps decoded: requests arrive slightly out of order, and going back costs a key"""
+
+KEPT_KEYS = 2
+"""Keyframes that a scene file keeps decoded: playback crosses from one segment into the next"""
+
+
+class Source(Protocol):
+    """A dynamic scene as the server reads it; frames and segments count from 0. One thread at a time asks."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def rate(self) -> Fraction:
+        """Nominal frames per second."""
+
+    @property
+    def times_ns(self) -> np.ndarray:
+        """int64 [T]: when each frame was filmed."""
+
+    @property
+    def quantizer(self) -> Quantizer: ...
+
+    @property
+    def cameras(self) -> tuple[PinholeCamera, ...]:
+        """Cameras of the capture, to jump to; may be empty."""
+
+    @property
+    def held_out(self) -> frozenset[str]:
+        """Names of the cameras that the fit never saw."""
+
+    @property
+    def near(self) -> float | None:
+        """Depth before which renders of this scene draw nothing, world; None to derive it from the cameras."""
+
+    @property
+    def segments(self) -> tuple[range, ...]:
+        """Frames of each segment without a gap; the first of each is its keyframe."""
+
+    def key(self, segment: int) -> Codes:
+        """All N Gaussians of a segment at its keyframe."""
+
+    def dynamic(self, segment: int) -> np.ndarray:
+        """bool [N]: the D rows that may differ from the keyframe within the segment."""
+
+    def moving(self, frame: int) -> Codes:
+        """The D dynamic rows of a frame."""
+
+
+@dataclass(frozen=True)
+class SegmentSource:
+    """Fitted segments in memory, before there is a scene file."""
+
+    parts: tuple[Segment, ...]
+    quantizer: Quantizer
+    rate: Fraction = Fraction(30)
+    cameras: tuple[PinholeCamera, ...] = ()
+    name: str = "segments"
+    held_out: frozenset[str] = field(default=frozenset())
+    near: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise ValueError("there is nothing to show without a segment; fit one first")
+        ends = [part.first + len(part) for part in self.parts]
+        for end, part in zip(ends, self.parts[1:], strict=False):
+            if part.first != end:
+                raise ValueError(
+                    f"segments must follow one another, but one ends at {end}, the next begins at {part.first}"
+                )
+
+    @property
+    def times_ns(self) -> np.ndarray:
+        return np.array([int(index * 10**9 / self.rate) for index in range(self.segments[-1].stop)], dtype=np.int64)
+
+    @property
+    def segments(self) -> tuple[range, ...]:
+        start = self.parts[0].first
+        return tuple(range(part.first - start, part.first - start + len(part)) for part in self.parts)
+
+    def key(self, segment: int) -> Codes:
+        return self.parts[segment].key
+
+    def dynamic(self, segment: int) -> np.ndarray:
+        return self.parts[segment].dynamic
+
+    def moving(self, frame: int) -> Codes:
+        segment, offset = locate(self.segments, frame)
+        part = self.parts[segment]
+        return part.key[part.dynamic] if offset == 0 else Codes(part.xyz[offset - 1], part.attributes[offset - 1])
+
+
+class SceneSource:
+    """An open scene file. Its rows are in storage order: a segment's dynamic rows come first."""
+
+    def __init__(self, scene: Scene) -> None:
+        header = scene.header
+        self._scene = scene
+        self.name, self.rate, self.times_ns = scene.path.name, header.rate, header.times_ns
+        self.quantizer, self.cameras, self.held_out = header.quantizer, header.cameras, frozenset(header.held_out)
+        self.near: float | None = header.extra.get("near")
+        self.segments = tuple(range(entry.first, entry.first + entry.frames) for entry in scene.index.segments)
+        self._keys: OrderedDict[int, Codes] = OrderedDict()
+        self._moving: OrderedDict[int, Codes] = OrderedDict()
+        self._last = -1  # frame at which the scene stands
+
+    def key(self, segment: int) -> Codes:
+        if segment not in self._keys:
+            self._keys[segment] = self._read(self.segments[segment].start)
+            while len(self._keys) > KEPT_KEYS:
+                self._keys.popitem(last=False)
+        return self._keys[segment]
+
+    def dynamic(self, segment: int) -> np.ndarray:
+        entry = self._scene.index.segments[segment]
+        return np.arange(entry.rows) < entry.dynamic
+
+    def moving(self, frame: int) -> Codes:
+        if frame not in self._moving:
+            segment, _ = locate(self.segments, frame)
+            on_the_way = self._last in self.segments[segment] and self._last < frame
+            for index in range(self._last + 1 if on_the_way else self.segments[segment].start, frame + 1):
+                self._keep(index, self._read(index)[: self._scene.index.segments[segment].dynamic])
+        return self._moving[frame]
+
+    def _read(self, frame: int) -> Codes:
+        codes = self._scene.codes(frame)
+        self._last = frame
+        return codes
+
+    def _keep(self, frame: int, codes: Codes) -> None:
+        self._moving[frame] = Codes(codes.xyz.copy(), codes.attributes.copy())  # a view would keep all rows alive
+        self._moving.move_to_end(frame)
+        row_bytes = codes.xyz.itemsize * 3 + codes.attributes.shape[1]
+        while len(self._moving) > 1 and sum(map(len, self._moving.values())) * row_bytes > CACHE_BYTES:
+            self._moving.popitem(last=False)
+
+
+@contextmanager
+def open_source(path: Path) -> Iterator[SceneSource]:
+    """A scene file to show; raises what `packuv.scene.open_scene` raises."""
+    with open_scene(path) as scene:
+        yield SceneSource(scene)
+
+
+def locate(segments: Sequence[range], frame: int) -> tuple[int, int]:
+    """Segment and offset within it; raises IndexError outside the scene."""
+    if not 0 <= frame < segments[-1].stop:
+        raise IndexError(f"frame {frame} of a scene with {segments[-1].stop} frames")
+    segment = bisect_right([frames.start for frames in segments], frame) - 1
+    return segment, frame - segments[segment].start
+
+
+def describe(source: Source) -> dict[str, Any]:
+    """The scene in words and numbers: what the page reads first."""
+    quantizer = source.quantizer
+    return {
+        "name": source.name,
+        "rate": [source.rate.numerator, source.rate.denominator],
+        "times_ns": (source.times_ns - source.times_ns[0]).tolist(),
+        "sh_degree": quantizer.sh_degree,
+        "columns": attribute_count(quantizer.sh_degree),
+        "centre": quantizer.centre.tolist(),
+        "near": near_plane(source),
+        "segments": [{"first": frames.start, "length": len(frames)} for frames in source.segments],
+        "cameras": [{**camera.to_json(), "held_out": camera.name in source.held_out} for camera in source.cameras],
+    }
+
+
+def near_plane(source: Source) -> float:
+    """Depth of the near plane, world: the scene's own, or a share of the rig's radius."""
+    if source.near is not None:
+        return source.near
+    if not source.cameras:
+        return NEAR_SHARE * source.quantizer.unit
+    centres = np.array([camera.centre for camera in source.cameras])  # [C, 3]
+    radius = float(np.median(np.linalg.norm(centres - centres.mean(axis=0), axis=1)))
+    return NEAR_SHARE * (radius or source.quantizer.unit)
+
+
+def tables_bytes(quantizer: Quantizer) -> bytes:
+    """float32 little-endian: positions [3, 65536], then attributes [A, 256]."""
+    return quantizer.xyz_table.astype("<f4").tobytes() + quantizer.attribute_table.astype("<f4").tobytes()
+
+
+def key_bytes(source: Source, segment: int) -> bytes:
+    """A keyframe, all N rows, plane by plane: head (N, D, A, 0), xyz [3, N], attributes [A, N], dynamic [N]."""
+    if not 0 <= segment < len(source.segments):
+        raise IndexError(f"segment {segment} of a scene with {len(source.segments)}")
+    codes, dynamic = source.key(segment), source.dynamic(segment)
+    head = _head(len(codes), int(dynamic.sum()), codes)
+    return head + _planes(codes.xyz, codes.attributes) + dynamic.astype(np.uint8).tobytes()
+
+
+def frame_bytes(source: Source, frame: int) -> bytes:
+    """A frame's D dynamic rows, less its keyframe's: head (segment, D, A, 0), xyz [3, D], attributes [A, D]."""
+    segment, _ = locate(source.segments, frame)
+    key, codes = source.key(segment)[source.dynamic(segment)], source.moving(frame)
+    # unsigned, so modulo 2^16 and 2^8
+    return _head(segment, len(codes), codes) + _planes(codes.xyz - key.xyz, codes.attributes - key.attributes)
+
+
+def _head(first: int, second: int, codes: Codes) -> bytes:
+    return np.array([first, second, codes.attributes.shape[1], 0], dtype="<u4").tobytes()
+
+
+def _planes(xyz: np.ndarray, attributes: np.ndarray) -> bytes:
+    return xyz.T.astype("<u2").tobytes() + attributes.T.tobytes()

@@ -1,0 +1,391 @@
+// The page's own work: playback, controls, and the traffic between the worker, the camera and the GPU.
+
+import { DEPTH_STOPS, MODES, SplatView } from "./splats.js";
+import { Navigation, frusta, worldOf } from "./navigation.js";
+
+const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
+const STALL_NOTICE_MS = 250;
+
+const at = (id) => document.getElementById(id);
+const canvas = at("picture");
+const wish = new URLSearchParams(location.hash.slice(1)); // frame, camera, mode, play=0, scale, background, bare=1
+
+const look = { mode: "colour", scale: 1, background: [0, 0, 0], range: [1, 2], lines: false };
+const player = {
+  frame: 0, shown: -1, playing: wish.get("play") !== "0", loops: true, speed: 1, due: 0, stalled: false, stalledAt: 0,
+};
+const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "" };
+const meter = { drawn: 0, frames: 0, since: performance.now(), sort_ms: 0, count: 0, moving: 0, seen: new Set() };
+let scene = null, world = null, frameCount = 0, rate = 30, keyframes = new Set();
+let waiting = false, stale = true, dirty = true, spare = null, previous = performance.now();
+
+let splats;
+const navigation = new Navigation(canvas, () => { stale = dirty = true; });
+const worker = new Worker("worker.js");
+worker.onmessage = ({ data }) => receive[data.type](data);
+worker.onerror = (event) => notice(`The worker stopped: ${event.message}`, true);
+
+// ---- messages
+
+const receive = {
+  scene(message) {
+    scene = message.scene;
+    rate = scene.rate[0] / scene.rate[1];
+    frameCount = scene.segments.reduce((sum, { length }) => sum + length, 0);
+    keyframes = new Set(scene.segments.map(({ first }) => first));
+    splats.setTables(message.tables, message.layers, scene.sh_degree);
+    world = worldOf(scene);
+    navigation.setWorld(world);
+    splats.setLines(frusta(scene, world));
+    fillPage();
+    requestAnimationFrame(tick);
+  },
+  buffered({ map, ahead }) {
+    Object.assign(buffer, { map, ahead });
+    drawMarks();
+  },
+  miss() { waiting = false; stale = false; },
+  picture(message) {
+    waiting = false;
+    if (message.key) splats.setKey(message.key.packed, message.key.slotCount, message.moving);
+    if (message.frame_codes) splats.setFrame(message.frame_codes.packed, message.frame_codes.rows);
+    splats.setOrder(message.order, message.visible);
+    spare = message.order.buffer;
+    settleRange(message.range, message.frame !== player.shown && player.shown >= 0);
+    if (message.frame !== player.shown) meter.frames++;
+    player.shown = message.frame;
+    Object.assign(meter, { count: message.count, moving: message.moving, sort_ms: message.sort_ms });
+    dirty = true;
+  },
+  problem({ text }) {
+    buffer.trouble = text;
+    notice("");
+  },
+};
+
+function ask() {
+  const { eye, forward, near } = navigation.view();
+  worker.postMessage({ type: "show", frame: player.frame, eye, forward, near, spare }, spare ? [spare] : []);
+  spare = null;
+  waiting = true;
+  stale = false;
+}
+
+function tellPlayhead() {
+  worker.postMessage({ type: "playhead", frame: player.frame, loops: player.loops });
+}
+
+// Depth colours follow the view, but slowly while it plays, or they would flicker.
+function settleRange([near, far], slowly) {
+  const next = [near, Math.max(far, near * 1.05)];
+  look.range = slowly ? look.range.map((value, k) => value * (next[k] / value) ** 0.1) : next;
+}
+
+// ---- playback
+
+// The playhead goes forward only onto frames that have arrived: at the end of the buffer it stands still.
+function advance(seconds) {
+  if (player.stalled && !mayResume()) return;
+  if (player.stalled) { player.stalled = false; notice(""); }
+  player.due += seconds * player.speed;
+  let moved = 0;
+  for (; moved < frameCount; moved++) {
+    const next = following(player.frame);
+    if (next === null) return pause();
+    if (player.due < shownFor(player.frame)) break;
+    if (!buffer.map[next]) { stall(); break; }
+    player.due -= shownFor(player.frame);
+    player.frame = next;
+  }
+  if (moved) { stale = true; tellPlayhead(); showClock(); }
+}
+
+function shownFor(frame) { // seconds; frames need not be evenly spaced
+  const next = frame + 1 < frameCount ? scene.times_ns[frame + 1] : scene.times_ns[frame] + 1e9 / rate;
+  return (next - scene.times_ns[frame]) / 1e9;
+}
+
+function following(frame) {
+  if (frame + 1 < frameCount) return frame + 1;
+  return player.loops && frameCount > 1 ? 0 : null;
+}
+
+function stall() {
+  player.stalled = true;
+  player.stalledAt = performance.now();
+  player.due = 0;
+  tellPlayhead();
+}
+
+function mayResume() {
+  if (performance.now() - player.stalledAt > STALL_NOTICE_MS && at("wait").hidden) notice("Loading frames…");
+  const enough = buffer.trouble ? 1 : Math.min(buffer.ahead - 1, Math.ceil(RESUME_SECONDS * rate * player.speed));
+  let next = player.frame;
+  for (let step = 0; step < enough; step++) {
+    next = following(next);
+    if (next === null) return true;
+    if (!buffer.map[next]) return false;
+  }
+  return true;
+}
+
+function seek(frame) {
+  player.frame = Math.max(0, Math.min(frameCount - 1, frame));
+  player.due = 0;
+  stale = true;
+  tellPlayhead();
+  showClock();
+}
+
+function pause() { setPlaying(false); }
+
+function setPlaying(playing) {
+  if (playing && following(player.frame) === null) seek(0);
+  Object.assign(player, { playing, due: 0, stalled: false });
+  notice("");
+  at("play").textContent = playing ? "Pause" : "Play";
+}
+
+// ---- drawing
+
+function tick(now) {
+  requestAnimationFrame(tick);
+  const seconds = Math.min(0.25, (now - previous) / 1000);
+  previous = now;
+  fitCanvas();
+  navigation.step(now, seconds);
+  if (player.playing && !scrubbing) advance(seconds);
+  if (!waiting && (stale || player.frame !== player.shown && buffer.map[player.frame])) ask();
+  if (dirty) drawPicture();
+  if (now - meter.since > 1000) showSpeeds(now);
+}
+
+function drawPicture() {
+  dirty = false;
+  const view = navigation.view();
+  splats.draw(view, look);
+  meter.drawn++;
+  outline(view.frame);
+  showLegend();
+  if (player.shown >= 0) document.documentElement.dataset.frame = player.shown; // for automation
+}
+
+function fitCanvas() {
+  const density = Math.min(2, devicePixelRatio) * Number(at("resolution").value);
+  const pixels = (size) => Math.max(1, Math.round(size * density));
+  const [width, height] = [pixels(canvas.clientWidth), pixels(canvas.clientHeight)];
+  if (canvas.width === width && canvas.height === height) return;
+  Object.assign(canvas, { width, height });
+  dirty = true;
+}
+
+function outline([left, top, width, height]) {
+  const box = at("frame-outline"), density = canvas.width / canvas.clientWidth;
+  box.hidden = !navigation.exact || navigation.jump !== null;
+  const sides = { left, top, width, height };
+  for (const [side, value] of Object.entries(sides)) box.style[side] = `${value / density}px`;
+  for (const button of at("cameras").children) {
+    button.setAttribute("aria-current", String(button.dataset.camera === navigation.exact));
+  }
+}
+
+function drawMarks() {
+  const marks = at("marks"), pen = marks.getContext("2d");
+  marks.width = Math.max(1, marks.clientWidth);
+  const step = marks.width / frameCount;
+  pen.fillStyle = "#ffffff1c";
+  pen.fillRect(0, 0, marks.width, 10);
+  pen.fillStyle = "#6cb2ff66";
+  for (let first = 0, frame = 0; frame <= frameCount; frame++) { // runs: single frames would leave seams
+    if (buffer.map[frame]) continue;
+    pen.fillRect(first * step, 0, (frame - first) * step, 10);
+    first = frame + 1;
+  }
+  pen.fillStyle = "#ffffffb0";
+  for (const frame of keyframes) pen.fillRect(Math.min(frame * step, marks.width - 1.5), 0, 1.5, 10);
+}
+
+// ---- words
+
+function showClock() {
+  const key = keyframes.has(player.frame) ? " · keyframe" : "";
+  const seconds = (scene.times_ns[player.frame] / 1e9).toFixed(3);
+  at("clock").innerHTML = `<b>${player.frame}</b> / ${frameCount - 1} · ${seconds} s${key}`;
+  at("scrub").value = player.frame;
+}
+
+function showSpeeds(now) {
+  const seconds = (now - meter.since) / 1000;
+  const [count, moving] = [meter.count, meter.moving].map((number) => number.toLocaleString("en"));
+  at("counts").textContent = `${count} Gaussians, ${moving} dynamic`;
+  const drawn = meter.drawn ? `${(meter.drawn / seconds).toFixed(meter.drawn < 5 ? 1 : 0)} fps` : "still";
+  const played = player.playing ? ` · ${(meter.frames / seconds).toFixed(1)} of ${rate.toFixed(0)} frames/s` : "";
+  at("speeds").textContent = `${drawn}${played} · sort ${meter.sort_ms.toFixed(1)} ms`;
+  Object.assign(meter, { drawn: 0, frames: 0, since: now });
+}
+
+function showLegend() {
+  at("legend").hidden = look.mode !== "depth";
+  at("nearest").textContent = look.range[0].toPrecision(2);
+  at("farthest").textContent = look.range[1].toPrecision(2);
+}
+
+function notice(text, bad = false) { // what went wrong stays until it is mended
+  if (!text && buffer.trouble) [text, bad] = [buffer.trouble, true];
+  const box = at("wait");
+  box.hidden = !text;
+  box.textContent = text;
+  box.classList.toggle("bad", bad);
+}
+
+function fillPage() {
+  document.title = `${scene.name} · PackUV`;
+  at("name").textContent = scene.name;
+  at("scrub").max = frameCount - 1;
+  at("ramp").style.background = `linear-gradient(90deg, ${DEPTH_STOPS.map((stop) => `rgb(${stop})`)})`;
+  for (const camera of scene.cameras) {
+    const button = document.createElement("button"), dot = document.createElement("i");
+    dot.classList.toggle("held", camera.held_out);
+    button.append(dot, camera.name);
+    if (camera.held_out) button.append(Object.assign(document.createElement("small"), { textContent: "held out" }));
+    button.dataset.camera = camera.name;
+    button.onclick = () => navigation.lookFrom(camera);
+    at("cameras").append(button);
+  }
+  at("cameras-head").hidden = !scene.cameras.length;
+  grantWish();
+  setPlaying(player.playing);
+  setNear(0);
+}
+
+function grantWish() {
+  const camera = scene.cameras.find(({ name }) => name === wish.get("camera")) ?? scene.cameras[0];
+  if (camera) navigation.lookFrom(camera, { animate: false, isHome: true });
+  if (MODES.includes(wish.get("mode"))) setMode(wish.get("mode"));
+  if (wish.has("scale")) setScale(Number(wish.get("scale")) || 1);
+  if (wish.has("background")) look.background = wish.get("background").split(",").map(Number);
+  if (wish.get("cameras") === "1") at("show-cameras").click();
+  document.body.classList.toggle("bare", wish.get("bare") === "1");
+  seek(Number(wish.get("frame")) || 0);
+}
+
+// ---- controls
+
+let scrubbing = false;
+
+function press(id, pressed) { at(id).setAttribute("aria-pressed", String(pressed)); }
+
+function setMode(mode) {
+  look.mode = mode;
+  for (const name of MODES) press(`mode-${name}`, name === mode);
+  dirty = true;
+}
+
+function setFlying(flying) {
+  navigation.flying = flying;
+  press("fly", flying);
+  press("orbit", !flying);
+}
+
+function setScale(scale) {
+  look.scale = Math.max(0.05, Math.min(1.5, scale));
+  at("scale").value = look.scale;
+  at("scale-value").textContent = look.scale.toFixed(2);
+  dirty = true;
+}
+
+function setNear(octaves) { // the slider counts doublings of the scene's own near plane
+  world.near = scene.near * 2 ** octaves;
+  at("near-value").textContent = world.near.toPrecision(2);
+  stale = dirty = true;
+}
+
+function setBackground() {
+  look.background = at("background").value.split(" ").map(Number);
+  dirty = true;
+}
+
+function toggleLoop() {
+  player.loops = !player.loops;
+  press("loop", player.loops);
+  tellPlayhead();
+}
+
+function toggleCameras() {
+  look.lines = !look.lines;
+  press("show-cameras", look.lines);
+  dirty = true;
+}
+
+function cycleCamera(step) {
+  const { cameras } = scene;
+  if (!cameras.length) return;
+  const now = cameras.findIndex(({ name }) => name === navigation.exact);
+  navigation.lookFrom(cameras[(now + step + cameras.length) % cameras.length]);
+}
+
+function focusAt(event) {
+  const density = canvas.width / canvas.clientWidth;
+  const [x, y] = [event.clientX * density, event.clientY * density];
+  const depth = splats.depthAt(navigation.view(), look, Math.floor(x), Math.floor(y));
+  if (depth !== null) navigation.focus(x, y, depth);
+}
+
+const KEYS = {
+  " ": () => setPlaying(!player.playing),
+  ArrowLeft: (event) => { pause(); seek(player.frame - (event.shiftKey ? 10 : 1)); },
+  ArrowRight: (event) => { pause(); seek(player.frame + (event.shiftKey ? 10 : 1)); },
+  Home: () => seek(0),
+  End: () => seek(frameCount - 1),
+  1: () => setMode("colour"),
+  2: () => setMode("depth"),
+  3: () => setMode("dynamic"),
+  f: () => setFlying(!navigation.flying),
+  r: () => navigation.reset(),
+  c: toggleCameras,
+  l: toggleLoop,
+  h: () => document.body.classList.toggle("bare"),
+  "[": () => cycleCamera(-1),
+  "]": () => cycleCamera(1),
+  "-": () => setScale(look.scale - 0.05),
+  "+": () => setScale(look.scale + 0.05),
+  "=": () => setScale(look.scale + 0.05),
+  "?": () => at("help").showModal(),
+};
+
+function listen() {
+  addEventListener("keydown", (event) => {
+    const action = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+    const typing = event.target.closest?.("select, dialog, label") || event.ctrlKey || event.metaKey || event.altKey;
+    if (!action || typing || !scene) return;
+    event.preventDefault();
+    action(event);
+  });
+  canvas.addEventListener("dblclick", focusAt);
+  canvas.addEventListener("webglcontextlost", () => notice("The graphics driver gave up this page; reload it.", true));
+  addEventListener("resize", () => { if (scene) drawMarks(); });
+  for (const mode of MODES) at(`mode-${mode}`).onclick = () => setMode(mode);
+  at("orbit").onclick = () => setFlying(false);
+  at("fly").onclick = () => setFlying(true);
+  at("reset").onclick = () => navigation.reset();
+  at("scale").oninput = (event) => setScale(Number(event.target.value));
+  at("near").oninput = (event) => setNear(Number(event.target.value));
+  at("background").onchange = setBackground;
+  at("show-cameras").onclick = toggleCameras;
+  at("play").onclick = () => setPlaying(!player.playing);
+  at("loop").onclick = toggleLoop;
+  at("speed").onchange = (event) => { player.speed = Number(event.target.value); };
+  at("scrub").oninput = (event) => { scrubbing = true; seek(Number(event.target.value)); };
+  at("scrub").onchange = () => { scrubbing = false; };
+  at("ask").onclick = () => at("help").showModal();
+  at("more").onclick = () => press("more", at("side").classList.toggle("open"));
+}
+
+try {
+  splats = new SplatView(canvas);
+  setBackground();
+  listen();
+  worker.postMessage({ type: "open" });
+} catch (error) {
+  notice(error.message, true);
+}

@@ -1,0 +1,70 @@
+"""The report of a run: report.json for programs, report.html for people."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from tasks.report_facts import (
+    LIMITS,
+    Comparison,
+    Finding,
+    FrameScore,
+    Limits,
+    MotionCurve,
+    ReportInput,
+    SceneFigures,
+    StageOutcome,
+    StageRecord,
+    findings,
+    frames_to_picture,
+    report_json,
+    scene_figures,
+)
+from tasks.report_page import page_text
+from tasks.store import write_json
+
+__all__ = [
+    "Comparison",
+    "Finding",
+    "FrameScore",
+    "Limits",
+    "MotionCurve",
+    "ReportFiles",
+    "ReportInput",
+    "SceneFigures",
+    "StageOutcome",
+    "StageRecord",
+    "findings",
+    "frames_to_picture",
+    "scene_figures",
+    "write_report",
+]
+
+JSON_NAME = "report.json"
+PAGE_NAME = "report.html"
+
+
+@dataclass(frozen=True)
+class ReportFiles:
+    """What `write_report` wrote."""
+
+    json: Path
+    page: Path
+
+
+def write_report(report: ReportInput, folder: Path, *, limits: Limits = LIMITS) -> ReportFiles:
+    """Write report.json and report.html into `folder`, which is made where it is missing.
+
+    Each file is replaced in one step. Raises FileNotFoundError for a picture that is not there, ValueError for one
+    that cannot be read or does not match its counterpart.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = ReportFiles(folder / JSON_NAME, folder / PAGE_NAME)
+    text = page_text(report, limits)
+    write_json(files.json, report_json(report, limits))
+    partial = files.page.with_name(f".{PAGE_NAME}.{os.getpid()}.part")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, files.page)
+    return files
