@@ -83,11 +83,9 @@ class PinholeCamera:
         """Inverse of `to_json`; raises ValueError that names a missing field."""
         try:
             return cls(
-                str(data["name"]),
-                int(data["width"]),
-                int(data["height"]),
-                *(float(data[key]) for key in ("fx", "fy", "cx", "cy")),
+                str(data["name"]), int(data["width"]), int(data["height"]),
+                float(data["fx"]), float(data["fy"]), float(data["cx"]), float(data["cy"]),
                 np.asarray(data["camera_from_world"], dtype=np.float64),
-            )
+            )  # fmt: skip
         except KeyError as missing:
             raise ValueError(f"a camera needs the field {missing}, but has {sorted(data)}") from None

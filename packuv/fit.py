@@ -180,7 +180,7 @@ def _fit_frame(
     loss, count = solver.settle(shots, options.frame_iterations)
     changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
     figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count, "loss": loss,
-               "dynamic": int(changed.sum()), "tiles": float(np.mean([np.mean(s.tiles) for s in shots]))}  # fmt: skip
+               "dynamic": int(changed.sum()), "tiles": float(np.mean([s.tiles.mean() for s in shots if s.tiles is not None]))}  # fmt: skip
     return changed, figures
 
 
@@ -192,7 +192,8 @@ def choose_quantizer(gaussians: Gaussians, bounds: Bounds, sh_degree: int) -> Qu
     low, high = low - margin, high + margin
     # Axes trade places while they are fitted: one range for all three.
     low[:3], high[:3] = low[:3].min(), high[:3].max()
-    low[3:6], high[3:6] = -1.0, 1.0
+    # A canonical rotation starts below 0.71 and may turn on by some ten degrees.
+    low[3:6], high[3:6] = -0.8, 0.8
     low[6], high[6] = OPACITY_RANGE
     # What comes into view later may have any colour of the picture.
     low[7:10], high[7:10] = np.minimum(low[7:10], -1.9).min(), np.maximum(high[7:10], 1.9).max()

@@ -102,13 +102,13 @@ class FrameReader:
         try:
             decoded = self._decoder(camera).get_frame_at(frame)
         except (RuntimeError, IndexError, ValueError) as error:
-            raise ValueError(f"{path}: frame {frame} cannot be decoded ({_first_line(error)})") from error
+            reason = f"cannot be decoded ({_first_line(error)})"
+            raise ValueError(f"{path}: frame {frame} {reason}; {_remux_advice(path)}") from error
         # Half a microsecond: far below any frame time, far above float64 rounding of seconds.
         if abs(decoded.pts_seconds - times[frame]) > 5e-7:
             raise ValueError(
                 f"{path}: frame {frame} should be shown at {times[frame]:.6f} s, but the decoder returned the "
-                f"picture of {decoded.pts_seconds:.6f} s; the file is damaged or its container cannot be searched: "
-                f"remux it (ffmpeg -i {path.name} -c copy {path.stem}.mkv)"
+                f"picture of {decoded.pts_seconds:.6f} s; {_remux_advice(path)}"
             )
         return decoded.data.numpy()
 
@@ -141,6 +141,11 @@ def packet_seconds(path: Path) -> np.ndarray:
     if not ticks or base is None:
         raise ValueError(f"{path} holds no timed video frames; remux it (ffmpeg -i {path.name} -c copy out.mkv)")
     return np.sort(np.array(ticks, dtype=np.int64)) * float(base)
+
+
+def _remux_advice(path: Path) -> str:
+    remux = f"ffmpeg -i {path.name} -c copy {path.stem}.mkv"
+    return f"the file is damaged or its container cannot be searched: remux it ({remux}), or record it again"
 
 
 def _first_line(error: Exception) -> str:

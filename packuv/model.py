@@ -83,7 +83,7 @@ class Model:
             state.first[rows], state.second[rows], state.steps[rows] = 0, 0, 0
 
 
-def rows_of(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+def rows_of(gaussians: Gaussians, rows: np.ndarray | slice) -> Gaussians:
     """Some rows, by index or mask, as copies."""
     return Gaussians(*(getattr(gaussians, name)[rows].copy() for name in ATTRIBUTES))
 

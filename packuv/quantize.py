@@ -138,7 +138,7 @@ class Quantizer:
         shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, 3 * coefficients)]
         out = [np.empty(shape, np.float32) for shape in shapes]
         _decode(codes.xyz, codes.attributes, self.xyz_table, self.attribute_table, *out)
-        return Gaussians(*out[:4], sh=out[4].reshape(count, coefficients, 3))
+        return Gaussians(out[0], out[1], out[2], out[3], out[4].reshape(count, coefficients, 3))
 
     def saturation(self, gaussians: Gaussians) -> int:
         """Number of values that lie more than half a step outside their range."""

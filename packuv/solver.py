@@ -50,9 +50,9 @@ class FitOptions:
     """Share of the first keyframe's iterations before the quantizer is fixed"""
     sh_degree: int = 0
     """View dependence: 0 none, 1 to 3 as in 3D Gaussian Splatting"""
-    near_share: float = 0.12
+    near_share: float = 0.2
     """Near plane, in scene radii; cameras may sit in the wall they film"""
-    near_jitter: float = 0.0
+    near_jitter: float = 0.5
     """Share of the iterations that draw the near plane at random up to `near_reach`: what only hides close before one
     camera cannot explain its picture then"""
     near_reach: float = 0.6
@@ -152,7 +152,7 @@ class Solver:
     def run(
         self, shots: Sequence[Shot], count: int, *, of: int, dense: bool = False, ticks: Ticks | None = None
     ) -> float:
-        """`count` iterations of `of`; `dense` also adds and prunes Gaussians. Returns the mean loss of the last pass."""
+        """`count` iterations of `of`, if `dense` with growth and pruning; returns the mean loss of the last pass."""
         losses = []
         self._order = []
         for _ in range(count):
@@ -206,7 +206,7 @@ class Solver:
         """What the renderer draws; only rows that may change are decoded again."""
         if self._quantizer is None:
             return self.model.gaussians
-        if self._drawn is None:
+        if self._drawn is None or self.rows.all():
             self._drawn = self._quantizer.decode(self._quantizer.encode(self.model.gaussians))
         else:
             rows = np.flatnonzero(self.rows)

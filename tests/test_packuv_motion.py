@@ -65,9 +65,9 @@ def cover(mask: np.ndarray, radius_px: int = 3) -> np.ndarray:
 @given(dx=st.integers(-9, 9), dy=st.integers(-9, 9))
 def test_flow_and_mask_of_a_moving_disc(dx: int, dy: int) -> None:
     step = measure_step(picture(150, 90), picture(150 + dx, 90 + dy), MotionOptions(flow_width=WIDTH))
-    # Measured at its fast preset: DIS is right to 0.36 px inside a textured disc.
+    # Measured over all steps of up to 9 px: DIS is right to 0.12 px inside a textured disc.
     error = np.linalg.norm(step.flow[disc(150, 90)] - [dx, dy], axis=1)
-    assert np.median(error) < 0.5
+    assert np.median(error) < 0.25
     moved = disc(150, 90) | disc(150 + dx, 90 + dy)
     if dx or dy:
         assert cover(step.mask)[moved].all()
@@ -86,8 +86,8 @@ def test_flow_is_in_pixels_of_the_full_picture_at_any_width() -> None:
         flow = optical_flow(before, after, MotionOptions(flow_width=width))
         assert flow.shape[:2] == fitted_size(WIDTH, HEIGHT, width)[::-1]
         inside = cv2.resize(flow, (WIDTH, HEIGHT))[disc(150, 90)]
-        # DIS at its fast preset falls short by 4 % at 320 and 19 % at 160; unscaled, it would by 50 %.
-        assert np.linalg.norm(np.median(inside, axis=0) - [6, 0]) < 0.25 * 6
+        # DIS falls short by 6 % at 160; unscaled, it would by 50 %.
+        assert np.linalg.norm(np.median(inside, axis=0) - [6, 0]) < 0.1 * 6
 
 
 @pytest.mark.parametrize("noise", [0.5, 2.0, 5.0])

@@ -1,0 +1,232 @@
+"""FFV1 pictures and attachments in one Matroska file, through PyAV alone.
+
+Every picture is intra-coded (g = 1), so any packet decodes by itself, and a packet's time is the time of the frame it
+belongs to, in milliseconds, Matroska's own clock in FFmpeg.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import av
+import numpy as np
+
+TIME_BASE = Fraction(1, 1000)
+MAGIC = b"\x1a\x45\xdf\xa3"
+"""First bytes of every EBML file."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """One FFV1 video track of 8-bit grey pictures."""
+
+    name: str
+    width: int
+    height: int
+    slices: int
+    """FFV1 slices of a picture, coded on their own; one a plane suits a mosaic"""
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One coded picture."""
+
+    track: int
+    """Number of its track in the file"""
+    time_ms: int
+    duration_ms: int
+    data: bytes
+
+
+class Encoder:
+    """Codes the pictures of one track. The bytes do not depend on `threads` (0: one per core)."""
+
+    def __init__(self, track: Track, *, threads: int = 0) -> None:
+        self._context = av.CodecContext.create("ffv1", "w")
+        assert isinstance(self._context, av.VideoCodecContext)
+        _configure(self._context, track)
+        self._context.thread_type = "SLICE"
+        self._context.thread_count = threads
+        self._track = track
+
+    def encode(self, picture: np.ndarray) -> bytes:
+        """The packet of a picture uint8 [height, width]."""
+        expected = (self._track.height, self._track.width)
+        if picture.shape != expected or picture.dtype != np.uint8:
+            raise ValueError(
+                f"track {self._track.name!r} holds uint8 {expected} pictures, but got {picture.dtype} {picture.shape}"
+            )
+        frame = av.VideoFrame.from_ndarray(picture, format="gray")
+        packets = self._context.encode(frame)
+        if len(packets) != 1:
+            raise RuntimeError(f"FFV1 must give one packet a picture, but gave {len(packets)}; report this PyAV build")
+        return bytes(packets[0])
+
+
+def _configure(context: av.VideoCodecContext, track: Track) -> None:
+    context.width, context.height, context.pix_fmt = track.width, track.height, "gray"
+    context.time_base = TIME_BASE
+    context.options = {
+        "level": "3",
+        "coder": "1",
+        "context": "0",  # the larger model is 2 % larger on keys and 3 % on residuals, which start anew each picture
+        "slices": str(track.slices),
+        "slicecrc": "1",
+        "g": "1",
+        "flags": "+bitexact",
+    }
+
+
+class Spool:
+    """Coded packets on disk, until all that the header says about them is known."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._index: list[tuple[int, int, int, int, int]] = []  # track, time, duration, offset, size
+
+    def append(self, packet: Packet) -> None:
+        offset = self._file.seek(0, os.SEEK_END)
+        self._file.write(packet.data)
+        self._index.append((packet.track, packet.time_ms, packet.duration_ms, offset, len(packet.data)))
+
+    def __iter__(self) -> Iterator[Packet]:
+        for track, time_ms, duration_ms, offset, size in self._index:
+            self._file.seek(offset)
+            yield Packet(track, time_ms, duration_ms, self._file.read(size))
+
+
+def write_matroska(
+    path: Path,
+    tracks: Sequence[Track],
+    packets: Iterable[Packet],
+    attachments: Mapping[str, tuple[str, bytes]],
+    *,
+    rate: Fraction,
+) -> None:
+    """Write packets, in order of time, and attachments (name -> MIME type, content); same input, same bytes.
+
+    The `bitexact` flag keeps dates, library versions and random identifiers out of the file.
+    """
+    options = {"fflags": "+bitexact", "max_interleave_delta": "1"}  # packets come in order: never hold them back
+    with av.open(str(path), "w", format="matroska", options=options) as container:
+        streams = []
+        for track in tracks:
+            stream = container.add_stream("ffv1", rate=rate)
+            _configure(stream.codec_context, track)
+            stream.metadata["title"] = track.name
+            stream.time_base = TIME_BASE
+            streams.append(stream)
+        for name, (mime, content) in attachments.items():
+            container.add_attachment(name, mime, content)
+        for packet in packets:
+            container.mux(_muxable(packet, streams[packet.track]))
+
+
+def _muxable(packet: Packet, stream: Any) -> av.Packet:
+    out = av.Packet(packet.data)
+    out.stream, out.time_base = stream, TIME_BASE
+    out.pts = out.dts = packet.time_ms
+    out.duration, out.is_keyframe = packet.duration_ms, True
+    return out
+
+
+@dataclass(frozen=True)
+class FoundPacket:
+    """A packet and where its bytes lie in the file."""
+
+    data: bytes
+    position: int
+    """Offset of the block that holds it, bytes from the start of the file"""
+
+
+class Reader:
+    """Packets by track and time, pictures by decoding them; one reader for one thread.
+
+    Raises FileNotFoundError for a missing file, and ValueError for one that is not Matroska, is cut short, or holds no
+    such packet.
+    """
+
+    def __init__(self, path: Path, *, threads: int = 0) -> None:
+        self._path = Path(path)
+        with self._path.open("rb") as file:
+            if file.read(4) != MAGIC:
+                raise ValueError(f"{path} is not a Matroska file")
+        try:
+            self._container = av.open(str(path), format="matroska", metadata_errors="replace")
+        except av.FFmpegError as error:
+            raise ValueError(f"{path}: its Matroska header is damaged or cut short ({error.strerror})") from None
+        self._decoders = [stream.codec_context for stream in self._container.streams.video]
+        for number, decoder in enumerate(self._decoders):
+            if decoder is None or decoder.name != "ffv1":
+                self._container.close()
+                raise ValueError(f"{path}: video track {number} must be FFV1; the file is damaged or no scene")
+            decoder.thread_type = "SLICE"  # no delay: one packet in, one picture out
+            decoder.thread_count = threads
+        self._packets: Iterator[av.Packet] = self._container.demux(*self._container.streams.video)
+
+    def close(self) -> None:
+        self._container.close()
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        """Names of the video tracks."""
+        return tuple(stream.metadata.get("title", "") for stream in self._container.streams.video)
+
+    @property
+    def attachments(self) -> dict[str, bytes]:
+        return {stream.name or "": stream.data or b"" for stream in self._container.streams.attachments}
+
+    def read(self, track: int, time_ms: int) -> FoundPacket:
+        """The packet of a track at a time. Reading in the order of the file costs no seek."""
+        found = self._scan(track, time_ms, first_only=True)
+        if found is None:
+            self._seek(track, time_ms)
+            found = self._scan(track, time_ms, first_only=False)
+        if found is None:
+            raise ValueError(
+                f"{self._path}: track {self.tracks[track]!r} has no packet at {time_ms} ms; "
+                "the file is damaged or cut short"
+            )
+        return found
+
+    def decode(self, track: int, data: bytes) -> np.ndarray:
+        """The picture of a packet, uint8 [height, width].
+
+        FFmpeg hides failed slice checksums; check the bytes first.
+        """
+        try:
+            frames = self._decoders[track].decode(av.Packet(data))
+        except av.FFmpegError as error:
+            raise ValueError(
+                f"{self._path}: a packet of track {self.tracks[track]!r} does not decode ({error.strerror})"
+            ) from None
+        if len(frames) != 1 or frames[0].format.name != "gray":
+            raise ValueError(f"{self._path}: track {self.tracks[track]!r} is not one of 8-bit grey FFV1 pictures")
+        return frames[0].to_ndarray()
+
+    def _scan(self, track: int, time_ms: int, *, first_only: bool) -> FoundPacket | None:
+        """Look for a packet from here on, at the next one only or until the track's time has passed."""
+        wanted = self._container.streams.video[track].index
+        try:
+            for packet in self._packets:
+                time = packet.pts if packet.stream.index == wanted else None
+                if time == time_ms:
+                    return FoundPacket(bytes(packet), packet.pos or 0)
+                if first_only or (time is not None and time > time_ms):
+                    return None
+        except (av.FFmpegError, EOFError):
+            return None
+        return None
+
+    def _seek(self, track: int, time_ms: int) -> None:
+        stream = self._container.streams.video[track]
+        try:
+            self._container.seek(time_ms, stream=stream)
+            self._packets = self._container.demux(*self._container.streams.video)
+        except av.FFmpegError:
+            self._packets = iter(())  # a file cut short has no such time: the scan reports it

@@ -1,0 +1,373 @@
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from packuv.camera import PinholeCamera
+from packuv.quantize import OPACITY, Codes, Quantizer, attribute_count
+from packuv.scene import SceneHeader, VerifyReport, digest, open_scene, verify_scene, write_scene
+from packuv.segment import Segment
+from packuv.stream import in_storage_order
+
+DOCUMENT = Path(__file__).parents[1] / "docs/scene-format.md"
+needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg program")
+
+
+def random_segment(rng, first, rows, dynamic, frames, degree):
+    """A random walk with births, deaths and frames in which nothing happens."""
+    columns, mask = attribute_count(degree), rng.permutation(rows) < dynamic
+    key = Codes(rng.integers(0, 65536, (rows, 3), np.uint16), rng.integers(0, 256, (rows, columns), np.uint8))
+    key.attributes[rng.random(rows) < 0.3, OPACITY] = 0
+    xyz, attributes = [key.xyz[mask]], [key.attributes[mask]]
+    for _ in range(frames - 1):
+        still = rng.random() < 0.25
+        xyz.append((xyz[-1] + (0 if still else rng.integers(-300, 301, (dynamic, 3)))).astype(np.uint16))
+        change = 0 if still else rng.integers(-4, 5, (dynamic, 1)) + rng.integers(0, 2, (dynamic, columns))
+        attributes.append((attributes[-1] + change).astype(np.uint8))
+        if not still:
+            attributes[-1][rng.random(dynamic) < 0.2, OPACITY] = 0
+    return Segment(first, key, mask, np.stack(xyz)[1:], np.stack(attributes)[1:])
+
+
+def random_sequence(seed, shapes, degree=0):
+    """Segments that follow one another, from (rows, dynamic, frames) each."""
+    rng, first, result = np.random.default_rng(seed), 0, []
+    for rows, dynamic, frames in shapes:
+        result.append(random_segment(rng, first, rows, dynamic, frames, degree))
+        first += frames
+    return result
+
+
+def save(folder, segments):
+    paths = [folder / f"segment{k}.npz" for k in range(len(segments))]
+    for path, segment in zip(paths, segments, strict=True):
+        segment.save(path)
+    return paths
+
+
+def quantizer(degree=0):
+    count = attribute_count(degree)
+    return Quantizer(np.array([1.0, 2, 3]), 0.5, np.full(3, 20.0), np.full(count, -1.5), np.full(count, 2.0), degree)
+
+
+def make_header(frames, degree=0):
+    cameras = tuple(
+        PinholeCamera(name, 64, 48, 50.5, 51, 32, 24.25, np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0])
+        for name in ("cam1", "cam2")
+    )
+    times = (np.arange(frames, dtype=np.int64) * 10**9 * 1001) // 30000 + 1_700_000_000_123_456_789
+    return SceneHeader(
+        quantizer(degree), times, Fraction(30000, 1001), cameras, ("cam2",), {"worst_ms": 3.25}, {"note": "größer"}
+    )
+
+
+def same(a, b):
+    return np.array_equal(a.xyz, b.xyz) and np.array_equal(a.attributes, b.attributes)
+
+
+def frames_of(segments):
+    return [stored.frame(k) for stored in map(in_storage_order, segments) for k in range(len(stored))]
+
+
+SHAPES = [(300, 90, 5), (1, 1, 3), (40, 0, 4), (700, 700, 2), (9, 9, 1), (1500, 20, 6)]
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory):
+    """One file of several different segments, and its frames."""
+    folder = tmp_path_factory.mktemp("scene")
+    segments = random_sequence(0, SHAPES)
+    write_scene(folder / "scene.mkv", save(folder, segments), make_header(21))
+    return folder / "scene.mkv", frames_of(segments)
+
+
+# Round trips
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.integers(0, 2**32 - 1),
+    st.lists(
+        st.tuples(st.integers(1, 400), st.sampled_from([0, 0.3, 1]), st.integers(1, 5)).map(
+            lambda shape: (shape[0], int(shape[0] * shape[1]), shape[2])
+        ),
+        min_size=1,
+        max_size=4,
+    ),
+    st.integers(0, 2),
+)
+def test_every_frame_comes_back_in_any_order(tmp_path, seed, shapes, degree):
+    segments = random_sequence(seed, shapes, degree)
+    frames = frames_of(segments)
+    header = make_header(len(frames), degree)
+    summary = write_scene(tmp_path / "scene.mkv", save(tmp_path, segments), header, threads=1)
+    assert summary.frames == len(frames)
+    assert summary.bytes == (tmp_path / "scene.mkv").stat().st_size > sum(summary.track_bytes.values())
+    assert list(summary.digests) == [digest(codes) for codes in frames]
+    with open_scene(tmp_path / "scene.mkv", threads=1) as scene:
+        assert len(scene) == len(frames)
+        for frame in [*range(len(frames)), *np.random.default_rng(seed).integers(0, len(frames), 6).tolist()]:
+            assert same(scene.codes(frame), frames[frame])
+
+
+def test_constant_channels_and_a_still_scene_take_no_space(tmp_path):
+    key = Codes(np.full((500, 3), 777, np.uint16), np.full((500, 10), 9, np.uint8))
+    still = Segment(0, key, np.ones(500, bool), np.repeat(key.xyz[None], 4, 0), np.repeat(key.attributes[None], 4, 0))
+    summary = write_scene(tmp_path / "scene.mkv", save(tmp_path, [still]), make_header(5))
+    assert set(summary.track_bytes) == {"key"}
+    with open_scene(tmp_path / "scene.mkv") as scene:
+        assert len(scene.index.tracks[0].mosaic.channels) == 1
+        assert all(same(scene.codes(frame), still.frame(frame)) for frame in range(5))
+
+
+def test_floats_are_those_of_the_quantizer(scene_file):
+    path, frames = scene_file
+    with open_scene(path) as scene:
+        for frame in (0, 3, 6, 9, 20):
+            got, expected = scene.gaussians(frame), quantizer().decode(frames[frame])
+            for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+                assert np.array_equal(getattr(got, name), getattr(expected, name))
+
+
+def test_codes_are_the_callers_own(scene_file):
+    path, frames = scene_file
+    with open_scene(path) as scene:
+        scene.codes(1).xyz[:] = 0
+        scene.codes(1).attributes[:] = 0
+        assert same(scene.codes(2), frames[2])
+
+
+def test_the_header_comes_back(scene_file):
+    written = make_header(21)
+    with open_scene(scene_file[0]) as scene:
+        header = scene.header
+    assert np.array_equal(header.times_ns, written.times_ns)
+    assert (header.rate, header.held_out, header.sync, header.extra) == (
+        written.rate,
+        written.held_out,
+        written.sync,
+        written.extra,
+    )
+    assert header.quantizer.to_json() == written.quantizer.to_json()
+    assert [camera.to_json() for camera in header.cameras] == [camera.to_json() for camera in written.cameras]
+
+
+def test_frames_are_found_by_time(scene_file):
+    with open_scene(scene_file[0]) as scene:
+        times = scene.header.times_ns.tolist()
+        assert [scene.frame_at(time) for time in times] == list(range(21))
+        assert [scene.frame_at(time - 1) for time in times] == [0, *range(20)]
+        assert scene.frame_at(times[-1] + 10**12) == 20
+        with pytest.raises(IndexError, match="frame 21 of a scene with 21 frames"):
+            scene.codes(21)
+
+
+# The file
+
+
+def test_same_input_same_bytes_whatever_the_threads(scene_file, tmp_path):
+    write_scene(tmp_path / "again.mkv", save(tmp_path, random_sequence(0, SHAPES)), make_header(21), threads=1)
+    assert (tmp_path / "again.mkv").read_bytes() == scene_file[0].read_bytes()
+
+
+@needs_ffmpeg
+def test_the_decoder_in_the_document_reads_the_scene(scene_file, tmp_path):
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
+    names: dict = {}
+    exec(code, names)
+    decoded = list(names["frames"](str(scene_file[0])))
+    assert len(decoded) == 21
+    for (xyz, attributes), codes in zip(decoded, scene_file[1], strict=True):
+        assert same(Codes(xyz, attributes), codes)
+
+
+@needs_ffmpeg
+def test_ffmpeg_sees_the_same_pictures_and_the_checksum_fits_the_header(scene_file, tmp_path):
+    path = scene_file[0]
+    subprocess.run(
+        ["ffmpeg", "-v", "error", "-dump_attachment:t", "", "-i", path, "-t", "0", "-f", "null", "-"],
+        check=True,
+        cwd=tmp_path,
+    )
+    checksum, name = (tmp_path / "packuv.sha256").read_text().split()
+    assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == checksum
+    header = json.loads((tmp_path / "packuv.json").read_text())
+    command = ["ffmpeg", "-v", "error", "-i", path, "-map", "0:v:0", "-fps_mode", "passthrough", "-f", "rawvideo", "-"]
+    raw = subprocess.run(command, check=True, capture_output=True).stdout
+    with open_scene(path) as scene:
+        starts = [segment["first"] for segment in header["segments"]]
+        pictures = [scene._picture(0, number, first) for number, first in enumerate(starts)]
+    assert raw == b"".join(picture.tobytes() for picture in pictures)
+
+
+def test_nothing_but_the_scene_is_left_behind(tmp_path):
+    segments = save(tmp_path, random_sequence(1, [(50, 10, 3)]))
+    (tmp_path / "out").mkdir()
+    write_scene(tmp_path / "out/scene.mkv", segments, make_header(3))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["scene.mkv"]
+    before = (tmp_path / "out/scene.mkv").read_bytes()
+    with pytest.raises(ValueError, match="hold 3 frames, but the header has 4 times"):
+        write_scene(tmp_path / "out/scene.mkv", segments, make_header(4))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["scene.mkv"]
+    assert (tmp_path / "out/scene.mkv").read_bytes() == before
+
+
+def test_progress_counts_every_frame_twice(tmp_path):
+    steps = []
+    segments = save(tmp_path, random_sequence(1, [(5, 5, 3), (5, 0, 2)]))
+    write_scene(
+        tmp_path / "scene.mkv", segments, make_header(5), progress=lambda done, total: steps.append((done, total))
+    )
+    assert steps == [(done, 10) for done in range(1, 11)]
+
+
+# Damage
+
+
+def test_a_whole_file_verifies(scene_file):
+    assert verify_scene(scene_file[0]) == VerifyReport(21, (), "")
+
+
+def damaged(scene_file, tmp_path, content):
+    path = tmp_path / "damaged.mkv"
+    path.write_bytes(content)
+    return path
+
+
+def complaint(path, frames):
+    """What is said about a file, empty if it is whole; frames that are called good are right, others are refused."""
+    try:
+        report = verify_scene(path, threads=1)
+    except ValueError as error:
+        return str(error)
+    with open_scene(path, threads=1) as scene:
+        for frame in sorted(set(range(len(frames))) - set(report.bad))[::3]:
+            assert same(scene.codes(frame), frames[frame])
+        for frame in report.bad[:1]:
+            with pytest.raises(ValueError, match=re.escape(str(path))):
+                scene.codes(frame)
+    return report.problem
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_file_cut_anywhere_says_so(scene_file, tmp_path, data):
+    content = scene_file[0].read_bytes()
+    # What follows the last packet is FFmpeg's seek index and statistics: 1 kB that nothing is lost with.
+    path = damaged(scene_file, tmp_path, content[: data.draw(st.integers(0, len(content) - 1024))])
+    assert str(path) in complaint(path, scene_file[1])
+
+
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_flipped_bit_never_gives_wrong_codes(scene_file, tmp_path, data):
+    content = bytearray(scene_file[0].read_bytes())
+    place = data.draw(st.integers(0, len(content) - 1) | st.integers(0, 6000))  # the headers are in the first 6 kB
+    content[place] ^= 1 << data.draw(st.integers(0, 7))
+    path = damaged(scene_file, tmp_path, bytes(content))
+    message = complaint(path, scene_file[1])
+    assert not message or str(path) in message
+
+
+def test_a_damaged_packet_is_named_and_costs_the_rest_of_its_segment(scene_file, tmp_path):
+    path, frames = scene_file
+    with open_scene(path) as scene:
+        entry = scene.index.segments[0]
+        step = next(k for k, prediction in enumerate(entry.predictions, start=1) if prediction and k > 1)
+        found = scene._reader.read(1, int(scene.header.times_ms[step]))
+    content = bytearray(path.read_bytes())
+    content[found.position + len(found.data) // 2] ^= 1
+    report = verify_scene(damaged(scene_file, tmp_path, bytes(content)))
+    assert report.bad == tuple(range(step, 5))
+    assert (
+        f"packet {entry.packet(step)} of track 'dynamic' (frame {step}, bytes from {found.position} on)"
+        in report.problem
+    )
+    with open_scene(tmp_path / "damaged.mkv") as scene:
+        with pytest.raises(ValueError, match="is damaged"):
+            scene.codes(4)
+        assert same(scene.codes(0), frames[0])
+        assert same(scene.codes(20), frames[20])
+
+
+def test_damage_to_the_header_is_named(scene_file, tmp_path):
+    content = scene_file[0].read_bytes().replace(b'"rate":"30000/1001"', b'"rate":"30000/1002"')
+    with pytest.raises(ValueError, match=r"header packuv\.json is damaged"):
+        open_scene(damaged(scene_file, tmp_path, content))
+
+
+def rewritten(scene_file, tmp_path, change):
+    """The scene with another header, whose checksum fits again."""
+    content = scene_file[0].read_bytes()
+    start = content.index(b'{"cameras":')
+    end = content.index(b"}", content.index(b'"version":')) + 1
+    document = content[start:end]
+    altered = change(document)
+    assert len(altered) == len(document)
+    old, new = (hashlib.sha256(text).hexdigest().encode() for text in (document, altered))
+    return damaged(scene_file, tmp_path, content.replace(document, altered).replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b'"version":1', b'"version":7', "it is packuv-scene version 7, layout compact; this program reads"),
+        (b'"layout":"compact"', b'"layout":"compacT"', "layout compacT"),
+        (b'"rows":300', b'"roWs":300', "lacks or misuses a field"),
+        (b'"rows":300', b'"rows":1e9', "segment at frame 0 does not fit"),
+        (b'"frames":5', b'"frames":4', "do not belong together"),
+        (b'"width":64', b'"widtH":64', "a camera needs the field 'width'"),
+        (b'"sh0_g"', b'"sh0_h"', "cannot be read"),
+    ],
+)
+def test_a_header_that_makes_no_sense_is_refused(scene_file, tmp_path, old, new, message):
+    path = rewritten(scene_file, tmp_path, lambda document: document.replace(old, new))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        open_scene(path)
+
+
+def test_what_is_no_scene_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        open_scene(tmp_path / "missing.mkv")
+    (tmp_path / "text.mkv").write_text("hello")
+    with pytest.raises(ValueError, match="not a Matroska file"):
+        verify_scene(tmp_path / "text.mkv")
+
+
+# What cannot be written
+
+
+def test_segments_must_follow_one_another_and_fit_the_quantizer(tmp_path):
+    first, second = save(tmp_path, random_sequence(0, [(5, 2, 3), (5, 2, 3)]))
+    with pytest.raises(ValueError, match="starts at instant 0, but the segment before it ends at 6"):
+        write_scene(tmp_path / "scene.mkv", [second, first], make_header(6))
+    with pytest.raises(ValueError, match="has 16 channels a row, but the header's quantizer 25"):
+        write_scene(tmp_path / "scene.mkv", [first, second], make_header(6, degree=1))
+    with pytest.raises(ValueError, match="at least one segment"):
+        write_scene(tmp_path / "scene.mkv", [], make_header(0))
+    empty = Codes(np.empty((0, 3), np.uint16), np.empty((0, 10), np.uint8))
+    nothing = Segment(0, empty, np.empty(0, bool), np.empty((0, 0, 3), np.uint16), np.empty((0, 0, 10), np.uint8))
+    with pytest.raises(ValueError, match="holds no Gaussians"):
+        write_scene(tmp_path / "scene.mkv", save(tmp_path, [nothing]), make_header(1))
+
+
+def test_a_header_is_checked_at_once():
+    times = np.arange(3, dtype=np.int64) * 10**7
+    with pytest.raises(ValueError, match="frames 1 and 2 are 400000 ns apart"):
+        SceneHeader(quantizer(), np.array([0, 10**7, 10**7 + 400_000]), Fraction(30))
+    with pytest.raises(ValueError, match="int64"):
+        SceneHeader(quantizer(), times.astype(float), Fraction(30))
+    with pytest.raises(ValueError, match="held-out cameras"):
+        SceneHeader(quantizer(), times, Fraction(30), held_out=("cam9",))
+    with pytest.raises(ValueError, match="plain JSON"):
+        SceneHeader(quantizer(), times, Fraction(30), extra={"a": np.float32(1)})
+    with pytest.raises(ValueError, match="rate must be positive"):
+        SceneHeader(quantizer(), times, Fraction(0))
