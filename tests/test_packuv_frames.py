@@ -31,7 +31,7 @@ from packuv.frames import (
 WIDTH, HEIGHT, COUNT = 96, 64, 40
 
 
-def write_video(path: Path, pictures: Sequence[np.ndarray], *, ticks: Sequence[int] | None = None) -> None:
+def write_video(path: Path, pictures: Sequence[np.ndarray] | np.ndarray, *, ticks: Sequence[int] | None = None) -> None:
     """Lossless H.264 in RGB with B-frames and a key frame every 16, shown at `ticks` thirtieths of a second."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264rgb", rate=30)

@@ -273,7 +273,7 @@ def test_a_killed_measurement_goes_on_to_the_same_bytes(views: Views, cache: Mot
     spec.write_text(json.dumps(views.to_spec()))
     killed = subprocess.run([sys.executable, "-c", KILLED, str(spec), str(folder), str(STEPS + 26)], check=False)
     assert killed.returncode == -signal.SIGKILL
-    with pytest.raises(ValueError, match="24 of 80 pictures in .* are not measured; run it again"):
+    with pytest.raises(ValueError, match=r"24 of 80 pictures in .* are not measured; run it again"):
         MotionCache.load(folder)
     counts: list[int] = []
     measure_motion(views, folder, MotionOptions(), workers=1, progress=lambda done, total: counts.append(done))

@@ -474,14 +474,19 @@ def align_stack(typing):
     return types.void(), generate
 
 
-@intrinsic
-def prefetch(typing, array, index):
-    """Ask for the cache line of flat element `index`, which need not exist."""
+def _prefetch(write: int) -> Any:
+    @intrinsic
+    def operation(typing, array, index):
+        def generate(context, builder, signature, args):
+            address = _pointer(context, builder, array, args[0], args[1], _I8)
+            flags = [ir.Constant(_I32, flag) for flag in (write, 3, 1)]  # keep in every cache, data
+            _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, *flags])
+            return context.get_dummy_value()
 
-    def generate(context, builder, signature, args):
-        address = _pointer(context, builder, array, args[0], args[1], _I8)
-        flags = [ir.Constant(_I32, flag) for flag in (0, 3, 1)]  # read, keep, data
-        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, *flags])
-        return context.get_dummy_value()
+        return types.void(array, types.int64), generate
 
-    return types.void(array, types.int64), generate
+    return operation
+
+
+prefetch, prefetch_to_write = _prefetch(0), _prefetch(1)
+"""Ask for the cache line of flat element `index`, which need not exist."""
