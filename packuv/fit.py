@@ -1,7 +1,7 @@
 """Fit Gaussians to the pictures of many cameras: the keyframe chain and the frames of each segment (paper §4.2).
 
     fit_first     pictures of one instant -> the first keyframe, and the quantizer of the whole sequence
-    fit_next      a keyframe and the pictures of a later instant -> the next keyframe; what did not change keeps its codes
+    fit_next      a keyframe and the pictures of a later instant -> the next one; what did not change keeps its codes
     fit_segment   a keyframe and the instants after it -> a `Segment`; frame by frame, from each to the next
 
 From the moment the quantizer is fixed every iteration renders decoded codes and the gradient passes straight through
@@ -18,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.density import opacity, prune
+from packuv.density import opacity
 from packuv.files import write_json, write_npz
 from packuv.frames import Views
+from packuv.freespace import sweep_free_space
 from packuv.labels import active_tiles, dynamic_labels
 from packuv.lift import lift_motion
 from packuv.model import ATTRIBUTES, Model, canonical, rows_of
@@ -28,7 +29,16 @@ from packuv.motion import MotionCache
 from packuv.quantize import OPACITY, OPACITY_RANGE, Codes, Gaussians, Quantizer, attribute_values
 from packuv.segment import Segment
 from packuv.solver import FitOptions, Progress, Shot, Solver, Ticks, halved
-from packuv.start import Bounds, Points, find_bounds, first_gaussians, hull_points, neighbour_distance, round_gaussians
+from packuv.start import (
+    Bounds,
+    Points,
+    Sights,
+    find_bounds,
+    first_gaussians,
+    hull_points,
+    neighbour_distance,
+    round_gaussians,
+)
 
 VERSION = 1
 """Raised with every change that alters what a fit returns"""
@@ -66,24 +76,36 @@ class KeyState:
 
 
 def fit_first(
-    views: Views, instant: int, *, points: Points | None, options: FitOptions, progress: Progress | None = None
+    views: Views,
+    instant: int,
+    *,
+    points: Points | None,
+    sights: Sights | None = None,
+    options: FitOptions,
+    progress: Progress | None = None,
 ) -> KeyState:
-    """Fit the first keyframe from sparse points and random Gaussians.
+    """Fit the first keyframe from sparse points and random Gaussians, none of them in air that `sights` cross.
 
     `views` must hold the cameras to fit and no others. Raises ValueError if fewer than two have a picture.
     """
     started = time.monotonic()
     shots = _shots(views, instant)
     bounds = find_bounds(views.cameras, near_share=options.near_share)
-    model = Model(first_gaussians([s.camera for s in shots], [s.target for s in shots], bounds=bounds, points=points,
-                                  options=options.start, sh_degree=options.sh_degree, seed=options.seed))  # fmt: skip
+    air = None
+    if sights is not None:
+        air = sweep_free_space(sights.origins, sights.ends, bounds=bounds, options=options.free_space)
+    start = first_gaussians([s.camera for s in shots], [s.target for s in shots], bounds=bounds, points=points,
+                            empty=air.contains if air else None, options=options.start,
+                            sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
+    model = Model(start)
     solver = Solver(model, bounds, options, np.random.default_rng([options.seed, instant, 0]))
+    solver.free_space = air
     ticks = Ticks(progress, options.iterations)
     coarse = round(options.iterations * options.coarse_share)
     floating = max(coarse, round(options.iterations * options.float_share))
     solver.run([halved(shot) for shot in shots], coarse, of=options.iterations, dense=True, ticks=ticks)
     solver.run(shots, floating - coarse, of=options.iterations, dense=True, ticks=ticks)
-    solver.keep(prune(model, solver.gradient, bounds=bounds, options=options.density, uv=options.uv))
+    solver.keep(solver.worth_keeping())
     model.gaussians = canonical(model.gaussians)
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
     solver.fix(choose_quantizer(model.gaussians, bounds, options.sh_degree))
@@ -122,7 +144,7 @@ def fit_next(
     shots = _tiled(shots, masks, solver, views)
     loss = solver.run(shots, options.key_iterations, of=options.key_iterations, dense=True,
                       ticks=Ticks(progress, options.key_iterations))  # fmt: skip
-    solver.keep(~solver.rows | prune(model, solver.gradient, bounds=bounds, options=options.density, uv=options.uv))
+    solver.keep(~solver.rows | solver.worth_keeping())
     return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, loss, solver))
 
 
@@ -136,7 +158,7 @@ def fit_segment(
     scratch: Path,
     progress: Progress | None = None,
 ) -> tuple[Segment, list[dict[str, float]]]:
-    """Fit the frames of one segment; `instants` starts with the keyframe's own. Returns the segment and figures per frame.
+    """Fit the frames of one segment; `instants` starts with the keyframe's own. Also returns figures per frame.
 
     After every frame the state goes to `scratch`, from which a later call continues with the same result.
     """

@@ -10,6 +10,7 @@ import numpy as np
 
 from packuv.camera import PinholeCamera
 from packuv.density import DensityOptions, ScreenGradient, grow, opacity, prune, relocate
+from packuv.freespace import FreeSpace, FreeSpaceOptions
 from packuv.labels import LabelOptions
 from packuv.lift import LiftOptions
 from packuv.losses import PhotometricOptions, photometric_loss
@@ -74,6 +75,7 @@ class FitOptions:
     settle: float = 0.003
     """A frame stops when a pass over the cameras improves the loss by less than this share"""
     seed: int = 0
+    free_space: FreeSpaceOptions = field(default_factory=FreeSpaceOptions)
     start: StartOptions = field(default_factory=StartOptions)
     density: DensityOptions = field(default_factory=DensityOptions)
     rates: Rates = field(default_factory=Rates)
@@ -114,6 +116,8 @@ class Solver:
         self.model = model
         self.rows = np.ones(len(model), bool)
         """Which Gaussians may change"""
+        self.free_space: FreeSpace | None = None
+        """Air that must stay empty"""
         self.gradient = ScreenGradient(len(model))
         self._quantizer: Quantizer | None = None
         self._drawn: Gaussians | None = None
@@ -236,10 +240,15 @@ class Solver:
             np.put_along_axis(pull, axis, (2 * options.scale_weight / count * excess * longest).astype(np.float32), 1)
             values["log_scales"] = values["log_scales"] + pull
 
+    def worth_keeping(self) -> np.ndarray:
+        """Rows that pruning leaves, bool [N]."""
+        keep = prune(self.model, self.gradient, bounds=self.bounds, options=self._options.density, uv=self._options.uv)
+        return keep if self.free_space is None else keep & ~self.free_space.contains(self.model.gaussians.means)
+
     def _round(self, of: int) -> None:
         """Prune, then grow towards the cap."""
         options = self._options.density
-        kept = ~self.rows | prune(self.model, self.gradient, bounds=self.bounds, options=options, uv=self._options.uv)
+        kept = ~self.rows | self.worth_keeping()
         score = np.where(self.rows & kept & (self.gradient.seen > 0), self.gradient.mean, 0)[kept]
         self.keep(kept)
         share = min(1.0, self.done / (of * options.until))

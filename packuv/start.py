@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +54,16 @@ class Points:
     """float64 [P, 3], in [0, 1]"""
 
 
+@dataclass(frozen=True)
+class Sights:
+    """Which camera sees which place: R lines that nothing crosses."""
+
+    origins: np.ndarray
+    """float64 [R, 3], camera centres, world"""
+    ends: np.ndarray
+    """float64 [R, 3]"""
+
+
 def find_bounds(cameras: Sequence[PinholeCamera], *, near_share: float) -> Bounds:
     """Centre and size of what the cameras look at. `near_share` is the near plane's share of the radius.
 
@@ -76,17 +86,18 @@ def first_gaussians(
     *,
     bounds: Bounds,
     points: Points | None,
+    empty: Callable[[np.ndarray], np.ndarray] | None = None,
     options: StartOptions,
     sh_degree: int,
     seed: int,
 ) -> Gaussians:
     """Gaussians on the sparse points and at random in the volume that several cameras see, coloured by the pictures.
 
-    Raises ValueError if no place is seen by enough cameras.
+    `empty` tells which points [N, 3] cannot be. Raises ValueError if no place is seen by enough cameras.
     """
     rng = np.random.default_rng(seed)
     chosen = _choose_points(points, round(options.count * options.point_share), rng)
-    volume = _random_points(cameras, pictures, bounds, options, options.count - len(chosen.xyz), rng)
+    volume = _random_points(cameras, pictures, bounds, empty, options, options.count - len(chosen.xyz), rng)
     xyz, rgb = (np.concatenate([getattr(chosen, name), getattr(volume, name)]) for name in ("xyz", "rgb"))
     spacing = neighbour_distance(xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 2 * np.median(spacing))
@@ -142,6 +153,7 @@ def _random_points(
     cameras: Sequence[PinholeCamera],
     pictures: Sequence[np.ndarray],
     bounds: Bounds,
+    empty: Callable[[np.ndarray], np.ndarray] | None,
     options: StartOptions,
     count: int,
     rng: np.random.Generator,
@@ -150,6 +162,7 @@ def _random_points(
     xyz, rgb = np.empty((0, 3)), np.empty((0, 3))
     for _ in range(_ROUNDS):
         drawn = random_ball(rng, 4 * count) * options.volume * bounds.radius + bounds.centre
+        drawn = drawn if empty is None else drawn[~empty(drawn)]
         colours, views = seen_colours(cameras, pictures, drawn, bounds.near)
         xyz, rgb = np.concatenate([xyz, drawn[views >= needed]]), np.concatenate([rgb, colours[views >= needed]])
         if len(xyz) >= count:
