@@ -7,11 +7,12 @@ Axes are OpenCV's: x right, y down, z forward. Poses map world to camera. The ce
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 
@@ -35,9 +36,15 @@ class Camera:
     """Linear-light factors r g b that bring this camera's pictures to the rig's common colour"""
 
     def __post_init__(self) -> None:
-        rotation = self.camera_from_world[:3, :3]
-        if self.camera_from_world.shape != (4, 4) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
-            raise ValueError(f"camera {self.name!r}: the pose must be a rigid [4, 4] transform")
+        if not _is_rigid(self.camera_from_world):
+            raise ValueError(f"camera {self.name!r}: the pose must be a rigid [4, 4] transform (no mirror, no scale)")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise ValueError(
+                f"camera {self.name!r}: OpenCV lens models have 4, 5 or 8 coefficients, not {len(self.distortion)}"
+            )
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, *self.gains)
+        if not np.all(np.isfinite(numbers)):
+            raise ValueError(f"camera {self.name!r}: intrinsics, lens and gains must be finite, but are {numbers}")
         if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
             raise ValueError(
                 f"camera {self.name!r}: size and focal lengths must be positive, but are "
@@ -53,6 +60,45 @@ class Camera:
     def centre(self) -> np.ndarray:
         """Where the camera stands, world, float64 [3]."""
         return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+
+    @property
+    def forward(self) -> np.ndarray:
+        """Unit viewing direction, world, float64 [3]."""
+        return self.camera_from_world[2, :3].copy()
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World points [N, 3] to pixels of the distorted picture [N, 2] and depth [N].
+
+        Pixels mean nothing where depth <= 0, or far outside the picture, where a lens polynomial may fold back.
+        """
+        local = self._local(points)
+        depth = local[:, 2]
+        plane = local[:, :2] / np.where(np.abs(depth) < 1e-12, 1e-12, depth)[:, None]
+        return distort(plane, self.distortion) * (self.fx, self.fy) + (self.cx, self.cy), depth
+
+    def plane_from_pixels(self, pixels: np.ndarray) -> np.ndarray:
+        """Pixels of the distorted picture [N, 2] to undistorted coordinates on the plane z = 1, float64 [N, 2]."""
+        plane = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not self.distortion or not len(plane):
+            return plane
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+        lens = np.asarray(self.distortion, dtype=np.float64)
+        return cv2.undistortPoints(plane[:, None], np.eye(3), lens, criteria=stop).reshape(-1, 2)
+
+    def sees(self, points: np.ndarray) -> np.ndarray:
+        """Which world points [N, 3] lie before the camera and inside its picture, bool [N]."""
+        pixels, depth = self.project(points)
+        inside = np.all((pixels >= 0) & (pixels <= (self.width, self.height)), axis=1) & (depth > 0)
+        if not self.distortion:
+            return inside
+        # A lens polynomial that folds back maps rays far outside the field of view into the picture.
+        local = self._local(points)
+        corners = self.plane_from_pixels(np.array([(x, y) for x in (0, self.width) for y in (0, self.height)]))
+        reach = 1.05 * np.linalg.norm(corners, axis=1).max()
+        return inside & (np.linalg.norm(local[:, :2], axis=1) <= reach * np.maximum(depth, 0))
+
+    def _local(self, points: np.ndarray) -> np.ndarray:
+        return points @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]  # [N, 3], camera axes
 
 
 @dataclass(frozen=True)
@@ -76,24 +122,71 @@ class Rig:
                 return camera
         raise KeyError(f"no camera {name!r} in the rig; it has {[camera.name for camera in self.cameras]}")
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(camera.name for camera in self.cameras)
+
+    @property
+    def centres(self) -> np.ndarray:
+        """Where the cameras stand, world, float64 [C, 3]."""
+        return np.stack([camera.centre for camera in self.cameras])
+
+    def select(self, names: Iterable[str]) -> Rig:
+        """The rig of the named cameras, in that order; raises KeyError for a name it lacks."""
+        return Rig(tuple(self[name] for name in names), self.source, self.metric)
+
     def save(self, path: Path) -> None:
-        """Write JSON; the docs name every field."""
-        cameras = [
-            {
-                "name": c.name, "width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
-                "distortion": list(c.distortion), "gains": list(c.gains), "camera_from_world": c.camera_from_world.tolist(),
-            }
-            for c in self.cameras
-        ]  # fmt: skip
+        """Write JSON; docs/calibration.md names every field."""
+        cameras = [_camera_to_json(camera) for camera in self.cameras]
         path.write_text(json.dumps({"source": self.source, "metric": self.metric, "cameras": cameras}, indent=1))
 
     @classmethod
     def load(cls, path: Path) -> Rig:
-        data = json.loads(path.read_text())
-        return cls(tuple(_camera_from_json(item) for item in data["cameras"]), data["source"], data["metric"])
+        """Inverse of `save`; raises ValueError that names the file and what it lacks."""
+        try:
+            data = json.loads(path.read_text())
+            cameras = tuple(_camera_from_json(item) for item in data["cameras"])
+            return cls(cameras, str(data["source"]), bool(data["metric"]))
+        except KeyError as missing:
+            raise ValueError(f"{path}: a rig file needs the field {missing}; docs/calibration.md lists them") from None
+        except (TypeError, json.JSONDecodeError) as problem:
+            raise ValueError(f"{path}: not a rig file ({problem}); docs/calibration.md shows one") from None
+
+
+def distort(plane: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """OpenCV's lens model (0, 4, 5 or 8 coefficients) on coordinates at z = 1: [N, 2] to [N, 2]."""
+    if not coefficients:
+        return plane
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *(0.0,) * (8 - len(coefficients)))
+    x, y = plane[:, 0], plane[:, 1]
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=1,
+    )
+
+
+def _is_rigid(pose: np.ndarray) -> bool:
+    if pose.shape != (4, 4) or not np.all(np.isfinite(pose)) or not np.array_equal(pose[3], (0, 0, 0, 1)):
+        return False
+    rotation = pose[:3, :3]
+    return bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0)
+
+
+def _camera_to_json(camera: Camera) -> dict[str, Any]:
+    numbers = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    lists = {"distortion": list(camera.distortion), "gains": list(camera.gains)}
+    return {"name": camera.name, **numbers, **lists, "camera_from_world": camera.camera_from_world.tolist()}
 
 
 def _camera_from_json(item: Mapping[str, Any]) -> Camera:
+    unknown = sorted(set(item) - {field.name for field in fields(Camera)})
+    if unknown:
+        raise ValueError(f"camera {item.get('name')!r} has the unknown fields {unknown}")
     return Camera(
         item["name"], item["width"], item["height"], item["fx"], item["fy"], item["cx"], item["cy"],
         np.asarray(item["camera_from_world"], dtype=np.float64), tuple(item["distortion"]), tuple(item["gains"]),

@@ -201,8 +201,9 @@ def _fit_frame(
     shots = _tiled(_shots(views, instant, masks), masks, solver, views)
     loss, count = solver.settle(shots, options.frame_iterations)
     changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
+    tiles = float(np.mean([shot.tiles.mean() for shot in shots if shot.tiles is not None]))
     figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count, "loss": loss,
-               "dynamic": int(changed.sum()), "tiles": float(np.mean([s.tiles.mean() for s in shots if s.tiles is not None]))}  # fmt: skip
+               "dynamic": int(changed.sum()), "tiles": tiles}  # fmt: skip
     return changed, figures
 
 

@@ -45,7 +45,7 @@ class FitOptions:
     """Of each later keyframe"""
     frame_iterations: int = 60
     """Of each frame inside a segment, at most"""
-    coarse_share: float = 0.4
+    coarse_share: float = 0.1
     """Share of the first keyframe's iterations on pictures of half the size"""
     float_share: float = 0.7
     """Share of the first keyframe's iterations before the quantizer is fixed"""
@@ -56,7 +56,7 @@ class FitOptions:
     near_jitter: float = 0.5
     """Share of the iterations that draw the near plane at random up to `near_reach`: what only hides close before one
     camera cannot explain its picture then"""
-    near_reach: float = 0.6
+    near_reach: float = 0.7
     """In scene radii"""
     opacity_weight: float = 0.0
     """Of mean alpha (1 - alpha), which makes Gaussians decide (paper, objective)"""

@@ -1,0 +1,114 @@
+"""Judge an imported calibration by pictures of one instant, and find out when its file follows another convention.
+
+Calibration files get their rotations transposed, their poses inverted or their axes flipped on the way between
+programs. The geometry alone rarely shows it: cameras on a dome still look inwards. Matches show it at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from calibration.accept import MatchesReport, PairMatches, Verdict, matches_report
+from calibration.features import Features, pairs_by_look
+from calibration.rig import Rig
+from calibration.triangulate import TriangulateOptions, choose_pairs, detect_all, verified_matches
+
+_DEFAULTS = TriangulateOptions()
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+class Reading(StrEnum):
+    """How the poses in a file may have been meant."""
+
+    AS_GIVEN = "as given"
+    TRANSPOSED = "rotations transposed"
+    INVERTED = "poses inverted (camera to world)"
+    OPENGL = "OpenGL camera axes"
+    INVERTED_OPENGL = "poses inverted, with OpenGL camera axes"
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the pictures say about a calibration."""
+
+    rig: Rig
+    """The rig to use; its source names the reading when that is not `AS_GIVEN`"""
+    reading: Reading
+    matches: MatchesReport
+    """Of `rig`"""
+    given: MatchesReport | None
+    """Of the calibration as the file gives it; None when its cameras see no common volume"""
+
+    def to_json(self) -> dict[str, Any]:
+        given = self.given.to_json() if self.given else None
+        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given}
+
+
+def judge(rig: Rig, pictures: Mapping[str, np.ndarray], *, options: TriangulateOptions = _DEFAULTS) -> Judgement:
+    """Compare the poses with matches between synchronized pictures, camera -> uint8 [H, W, 3] RGB.
+
+    Poses that the pictures reject are read again in other conventions, and the one they accept is taken. When they
+    accept none, the given rig comes back with `Verdict.REJECTED`. Raises ValueError for pictures that do not fit the
+    rig, and when no reading gives the cameras a common volume.
+    """
+    features = detect_all(rig, pictures, options=options.features)
+    given = _report(rig, features, options)
+    if given is not None and given.verdict is not Verdict.REJECTED:
+        return Judgement(rig, Reading.AS_GIVEN, given, given)
+    pairs = pairs_by_look(features, ratio=options.ratio)
+    evidence = verified_matches(rig, features, pairs, ratio=options.ratio)
+    for reading in _by_promise(rig, evidence, options):
+        other = reread(rig, reading)
+        report = _report(other, features, options)
+        if report is not None and report.verdict is Verdict.ACCEPTED:
+            return Judgement(other, reading, report, given)
+    if given is None:
+        raise ValueError(
+            f"{rig.source}: the cameras see no common volume, and the pictures agree with no other reading"
+        )
+    return Judgement(rig, Reading.AS_GIVEN, given, given)
+
+
+def reread(rig: Rig, reading: Reading) -> Rig:
+    """The rig whose poses are read in another convention."""
+    if reading is Reading.AS_GIVEN:
+        return rig
+    cameras = (replace(c, camera_from_world=_reread_pose(c.camera_from_world, reading)) for c in rig.cameras)
+    return Rig(tuple(cameras), f"{rig.source}, read with {reading.value}", rig.metric)
+
+
+def _reread_pose(pose: np.ndarray, reading: Reading) -> np.ndarray:
+    if reading is Reading.TRANSPOSED:
+        turned = pose.copy()
+        turned[:3, :3] = pose[:3, :3].T
+        return turned
+    inverse = np.eye(4)
+    inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+    return {Reading.INVERTED: inverse, Reading.OPENGL: _OPENGL @ pose, Reading.INVERTED_OPENGL: _OPENGL @ inverse}[
+        reading
+    ]
+
+
+def _report(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> MatchesReport | None:
+    """Matches of neighbouring cameras under the poses; None when the cameras see no common volume."""
+    try:
+        pairs = choose_pairs(rig, neighbours=options.neighbours)
+    except ValueError:
+        return None
+    near = [(first, second) for first, second in pairs if first in features and second in features]
+    return matches_report(rig, verified_matches(rig, features, near, ratio=options.ratio), options=options.judge)
+
+
+def _by_promise(rig: Rig, evidence: Sequence[PairMatches], options: TriangulateOptions) -> list[Reading]:
+    """The other readings, best first, by what they explain of matches found without any poses."""
+    others = [reading for reading in Reading if reading is not Reading.AS_GIVEN]
+    promise = {
+        reading.value: matches_report(reread(rig, reading), evidence, options=options.judge).explained_share or 0.0
+        for reading in others
+    }
+    return sorted(others, key=lambda reading: -promise[reading.value])

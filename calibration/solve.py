@@ -1,0 +1,237 @@
+"""A rig from pictures alone: features and matches here, COLMAP's incremental mapper in a subprocess.
+
+Every device has a lens of its own. The rig stands still, so features of several synchronized instants of a camera count
+as features of one picture; matches only join features of the same instant. Full registration at one pixel is no proof
+(research: wrong rigs reach it), so the result is judged by all verified matches.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.accept import MatchesReport, MatchOptions, PairMatches, Verdict, matches_report
+from calibration.features import FeatureOptions, Features, detect, match, pairs_by_look
+from calibration.importers import load_rig
+from calibration.rig import Rig
+
+_STEERING = ("lens", "shared_lens", "focal_factor", "min_pair_matches", "min_pair_share", "seed", "threads")
+
+
+class Lens(StrEnum):
+    """COLMAP's lens models that a rig can hold, by what they leave free."""
+
+    PINHOLE = "PINHOLE"
+    SIMPLE_RADIAL = "SIMPLE_RADIAL"
+    RADIAL = "RADIAL"
+    OPENCV = "OPENCV"
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """How a rig is solved and when it is believed."""
+
+    features: FeatureOptions = field(default_factory=FeatureOptions)
+    ratio: float = 0.8
+    """Lowe's ratio"""
+    lens: Lens = Lens.SIMPLE_RADIAL
+    """One focal length and one radial term suffice for most lenses; few pictures do not support more"""
+    shared_lens: bool = False
+    """True if all devices of a picture size have the same lens at the same zoom; it steadies sparse rigs"""
+    focal_factor: float = 1.2
+    """First guess of the focal length, in longer picture sides"""
+    min_pair_matches: int = 30
+    """Matches that must agree on one epipolar geometry for a pair to count. COLMAP's 15 let the repeated panels of a
+    dome agree by chance: 27 cameras, 3 instants, then explained 75 % of the matches, with 30 they explained 86 %"""
+    min_pair_share: float = 0.3
+    """Share of a pair's matches that must agree"""
+    seed: int = 0
+    threads: int = 1
+    """More than one is faster and no longer repeatable to the last bit"""
+    min_registered: float = 0.9
+    """Share of the cameras that must be placed"""
+    judge: MatchOptions = field(default_factory=MatchOptions)
+    timeout_seconds: float = 3600.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.ratio <= 1 or self.focal_factor <= 0 or self.threads < 1 or self.timeout_seconds <= 0:
+            raise ValueError(f"ratio must be in (0, 1]; focal factor, threads and timeout positive: {self}")
+        if not 0 < self.min_registered <= 1:
+            raise ValueError(f"min_registered is a share of the cameras in (0, 1], not {self.min_registered}")
+
+
+def solve_rig(pictures: Mapping[str, np.ndarray | Sequence[np.ndarray]], options: SolveOptions, workspace: Path) -> Rig:
+    """Place the cameras by their pictures, camera -> uint8 [H, W, 3] RGB, one or a list of synchronized instants.
+
+    A camera that most of its pairs contradict counts as not placed and is left out of the rig. Raises ValueError when
+    fewer than two cameras are given, when too few can be placed, or when the placed cameras do not explain the matches;
+    the message says which were placed and what to try. The workspace keeps COLMAP's files, its log, and report.json.
+    The scale and the orientation of the world are arbitrary.
+    """
+    instants = _instants(pictures)
+    workspace.mkdir(parents=True, exist_ok=True)
+    features = {
+        name: [detect(picture, options=options.features) for picture in shots] for name, shots in instants.items()
+    }
+    keypoints = {name: _keypoints(shots) for name, shots in features.items()}
+    result = _map(instants, keypoints, _matches(features, keypoints, options), options, workspace)
+    placed = _placed(list(instants), result["registered"], options, workspace)
+    rig = load_rig(workspace / "model", names=placed)
+    report = _judge(rig, keypoints, workspace, options)
+    (workspace / "report.json").write_text(json.dumps({**result, "matches": report.to_json()}, indent=1))
+    _check_explained(report, workspace)
+    believed = [name for name in placed if name not in report.bad_cameras]
+    rig = rig.select(_placed(list(instants), believed, options, workspace))
+    count = f"{len(rig.cameras)} of {len(instants)} cameras"
+    return Rig(rig.cameras, f"COLMAP, {count}, {result['reprojection_px']:.2f} px, {report.reason}")
+
+
+def _instants(pictures: Mapping[str, np.ndarray | Sequence[np.ndarray]]) -> dict[str, list[np.ndarray]]:
+    listed = {name: [shots] if isinstance(shots, np.ndarray) else list(shots) for name, shots in pictures.items()}
+    counts = {name: len(shots) for name, shots in listed.items()}
+    if len(listed) < 2 or len(set(counts.values())) != 1 or 0 in counts.values():
+        raise ValueError(f"a solve needs two cameras or more with the same number of instants each, but got {counts}")
+    for name, shots in listed.items():
+        if any(shot.dtype != np.uint8 or shot.ndim != 3 or shot.shape != shots[0].shape for shot in shots):
+            raise ValueError(f"camera {name!r} needs uint8 pictures [H, W, 3] of one size, "
+                             f"but got {[(str(shot.dtype), shot.shape) for shot in shots]}")  # fmt: skip
+    return listed
+
+
+@dataclass(frozen=True)
+class _Keypoints:
+    """The features of all instants of one camera, those that stand still counted once."""
+
+    pixels: np.ndarray
+    """float64 [K, 2]"""
+    rows: tuple[np.ndarray, ...]
+    """For each instant, int32 [N], the row of `pixels` of each feature"""
+
+
+def _keypoints(shots: Sequence[Features], still_px: float = 1.0) -> _Keypoints:
+    """Put the features of several instants together.
+
+    The static scene shows the same features, and the same wrong matches, at every instant; counted anew each time, a
+    few wrong ones would soon outnumber what COLMAP asks of a pair.
+    """
+    pixels, rows = shots[0].pixels, [np.arange(len(shots[0].pixels), dtype=np.int32)]
+    for shot in shots[1:]:
+        nearest, distance = _nearest(shot.pixels, pixels)
+        new = distance > still_px
+        numbers = np.where(new, len(pixels) + np.cumsum(new) - 1, nearest)
+        rows.append(numbers.astype(np.int32))
+        pixels = np.concatenate([pixels, shot.pixels[new]])
+    return _Keypoints(pixels, tuple(rows))
+
+
+def _nearest(points: np.ndarray, among: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row of the nearest of `among` [K, 2] for each of `points` [N, 2], and its distance; 256 points at a time."""
+    if not len(among):
+        return np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+    nearest = [
+        ((among[None] - points[start : start + 256, None]) ** 2).sum(axis=2).argmin(axis=1)
+        for start in range(0, len(points), 256)
+    ]
+    rows = np.concatenate([*nearest, np.zeros(0, np.int64)])
+    return rows, np.linalg.norm(among[rows] - points, axis=1)
+
+
+def _matches(
+    features: Mapping[str, Sequence[Features]], keypoints: Mapping[str, _Keypoints], options: SolveOptions
+) -> dict[str, np.ndarray]:
+    """'a b' (indices of cameras) -> int32 [K, 2], rows of the cameras' keypoints, each row in at most one match."""
+    names = list(features)
+    pairs = pairs_by_look({name: shots[0] for name, shots in features.items()}, ratio=options.ratio)
+    found = {}
+    for first, second in pairs:
+        parts = []
+        for index, (a, b) in enumerate(zip(features[first], features[second], strict=True)):
+            rows = match(a, b, ratio=options.ratio)[0]
+            ends = keypoints[first].rows[index][rows[:, 0]], keypoints[second].rows[index][rows[:, 1]]
+            parts.append(np.stack(ends, axis=1))
+        found[f"{names.index(first)} {names.index(second)}"] = _one_to_one(np.unique(np.concatenate(parts), axis=0))
+    return found
+
+
+def _one_to_one(rows: np.ndarray) -> np.ndarray:
+    """Matches [K, 2] whose ends have no other match; instants that contradict each other prove neither."""
+    clear = np.ones(len(rows), bool)
+    for column in rows.T:
+        _, inverse, counts = np.unique(column, return_inverse=True, return_counts=True)
+        clear &= counts[inverse] == 1
+    return rows[clear].astype(np.int32)
+
+
+def _map(
+    instants: Mapping[str, Sequence[np.ndarray]],
+    keypoints: Mapping[str, _Keypoints],
+    matched: Mapping[str, np.ndarray],
+    options: SolveOptions,
+    workspace: Path,
+) -> dict[str, Any]:
+    """Run the mapper; raises ValueError with the end of its log when it fails or takes too long."""
+    for stale in ("result.json", "inliers.npz"):
+        (workspace / stale).unlink(missing_ok=True)
+    for stale in ("model", "mapped"):
+        shutil.rmtree(workspace / stale, ignore_errors=True)
+    pixels = {f"keypoints {index}": points.pixels for index, points in enumerate(keypoints.values())}
+    np.savez(workspace / "matches.npz", **pixels, **matched)  # type: ignore[arg-type]  # keys are no keywords of savez
+    (workspace / "spec.json").write_text(json.dumps(_spec(instants, options), indent=1))
+    command = [sys.executable, "-m", "calibration.mapper", str((workspace / "spec.json").resolve())]
+    with (workspace / "mapper.log").open("w") as log:
+        try:
+            subprocess.run(command, stdout=log, stderr=log, timeout=options.timeout_seconds, check=True)
+        except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as problem:
+            tail = (workspace / "mapper.log").read_text(errors="replace")[-500:]
+            raise ValueError(f"COLMAP must finish, but {problem}; its log ends: {tail}") from None
+    return dict(json.loads((workspace / "result.json").read_text()))
+
+
+def _spec(instants: Mapping[str, Sequence[np.ndarray]], options: SolveOptions) -> dict[str, Any]:
+    cameras = [
+        {"name": name, "width": shots[0].shape[1], "height": shots[0].shape[0]} for name, shots in instants.items()
+    ]
+    steering = {key: getattr(options, key) for key in _STEERING}
+    return {"cameras": cameras, **steering}
+
+
+def _placed(names: Sequence[str], found: Sequence[str], options: SolveOptions, workspace: Path) -> list[str]:
+    """The cameras found, in the order of `names`; raises ValueError when they are too few."""
+    placed = [name for name in names if name in found]
+    if len(placed) >= max(2, options.min_registered * len(names)):
+        return placed
+    raise ValueError(
+        f"COLMAP must place {options.min_registered:.0%} of {len(names)} cameras so that the matches agree, but placed "
+        f"{len(placed)} ({placed}), not {[name for name in names if name not in placed]}; give more instants, pictures "
+        f"with more texture, or a calibration of your own (log: {workspace / 'mapper.log'})"
+    )
+
+
+def _judge(rig: Rig, keypoints: Mapping[str, _Keypoints], workspace: Path, options: SolveOptions) -> MatchesReport:
+    """How the solved rig explains the matches that agreed pair by pair."""
+    names, pixels = list(keypoints), [points.pixels for points in keypoints.values()]
+    evidence = []
+    with np.load(workspace / "inliers.npz") as inliers:
+        for pair, rows in inliers.items():
+            a, b = (int(part) for part in pair.split())
+            if names[a] in rig.names and names[b] in rig.names:
+                evidence.append(PairMatches(names[a], names[b], pixels[a][rows[:, 0]], pixels[b][rows[:, 1]]))
+    return matches_report(rig, evidence, options=options.judge)
+
+
+def _check_explained(report: MatchesReport, workspace: Path) -> None:
+    if report.verdict is Verdict.REJECTED:
+        raise ValueError(
+            f"the solved rig must explain the matches, but {report.reason}; bad cameras {list(report.bad_cameras)}, "
+            f"{len(report.bad_pairs)} bad pairs of {report.pairs}; give more instants that are really synchronized, "
+            f"or a calibration of your own (report: {workspace / 'report.json'})"
+        )

@@ -1,0 +1,314 @@
+"""Points of the scene from synchronized pictures and known poses.
+
+Each picture gives SIFT features; neighbouring cameras match them along epipolar lines; matches chain into tracks, one
+feature per camera; each track becomes a point that every camera of the track sees within a few pixels and with
+parallax, or is dropped. The rig does not move, so points of several instants may simply be put together.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calibration.accept import MatchesReport, MatchOptions, PairMatches, check_rig, matches_report
+from calibration.features import Band, FeatureOptions, Features, detect, match
+from calibration.multiview import Sightings, essential, locate, medians
+from calibration.rig import Camera, Rig
+from calibration.tracks import Link, chain
+
+_LINEAR = np.array(
+    [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.arange(256) / 255], dtype=np.float32
+)
+"""sRGB's electro-optical transfer function for 8-bit values: uint8 to linear light in [0, 1]"""
+
+
+@dataclass(frozen=True)
+class TriangulateOptions:
+    """Which matches become points."""
+
+    features: FeatureOptions = field(default_factory=FeatureOptions)
+    neighbours: int = 8
+    """Cameras that each camera is matched with; time grows with it"""
+    ratio: float = 0.8
+    """Lowe's ratio among the candidates near the epipolar line, and for matches that judge the poses"""
+    epipolar_px: float = 2.0
+    """Greatest distance from the epipolar line, pixels"""
+    max_error_px: float = 2.0
+    """Greatest reprojection error of an observation; the worst one of a track is dropped while it exceeds this"""
+    min_views: int = 3
+    """Cameras that must see a point; two features on one epipolar line always make a point, right or wrong"""
+    min_angle_deg: float = 1.5
+    """Greatest angle between two rays of a point must reach this, or its depth is a guess"""
+    patch_px: int = 5
+    """Side of the square whose mean is an observation's colour"""
+    judge: MatchOptions = field(default_factory=MatchOptions)
+
+    def __post_init__(self) -> None:
+        if self.neighbours < 1 or not 0 < self.ratio <= 1 or min(self.epipolar_px, self.max_error_px) <= 0:
+            raise ValueError(f"neighbours, ratio and pixel limits must be positive, and ratio at most 1: {self}")
+        if self.min_views < 2 or not 0 <= self.min_angle_deg < 180 or self.patch_px < 1:
+            raise ValueError(f"a point needs at least two views, an angle below 180 degrees and a patch: {self}")
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """Triangulated points and what they look like in each camera; observations are sorted by point, then camera."""
+
+    cameras: tuple[str, ...]
+    """Names, in the order of the rig"""
+    xyz: np.ndarray
+    """float64 [P, 3], world"""
+    rgb: np.ndarray
+    """uint8 [P, 3], sRGB, median over the cameras before any colour balance"""
+    views: np.ndarray
+    """int32 [P], number of cameras"""
+    error_px: np.ndarray
+    """float32 [P], root mean square reprojection error"""
+    instant: np.ndarray
+    """int32 [P], position of the point's instant in the input"""
+    point: np.ndarray
+    """int32 [M], row of xyz that an observation is of"""
+    camera: np.ndarray
+    """int32 [M], index into `cameras`"""
+    xy: np.ndarray
+    """float32 [M, 2], pixels of the undistorted picture with the rig's focal lengths and principal point"""
+    colour: np.ndarray
+    """float32 [M, 3], linear light in [0, 1], mean of a patch; NaN where a pixel of it is near black or white"""
+    matches: MatchesReport
+    """How well the poses explain matches found without them"""
+
+    def save(self, path: Path) -> None:
+        """Write one .npz; the same points give the same bytes."""
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        np.savez(path, cameras=np.array(self.cameras), matches=np.array(json.dumps(self.matches.to_json())), **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> SparsePoints:
+        with np.load(path, allow_pickle=False) as data:
+            report = MatchesReport.from_json(json.loads(str(data["matches"])))
+            names = tuple(str(name) for name in data["cameras"])
+            return cls(cameras=names, matches=report, **{name: data[name] for name in _ARRAYS})
+
+
+_ARRAYS = ("xyz", "rgb", "views", "error_px", "instant", "point", "camera", "xy", "colour")
+
+
+def triangulate(
+    rig: Rig,
+    instants: Iterable[Mapping[str, np.ndarray]],
+    *,
+    options: TriangulateOptions = TriangulateOptions(),
+) -> SparsePoints:
+    """Points from pictures camera -> uint8 [H, W, 3] RGB, as filmed (distorted), one mapping per synchronized instant.
+
+    An instant may lack cameras. Deterministic. Raises ValueError for pictures that do not fit the rig, for a rig
+    without a common volume, and when no point is found.
+    """
+    pairs = choose_pairs(rig, neighbours=options.neighbours)
+    parts, evidence = [], []
+    for pictures in instants:
+        features = detect_all(rig, pictures, options=options.features)
+        near = [(first, second) for first, second in pairs if first in features and second in features]
+        parts.append(_part(rig, pictures, features, near, options))
+        evidence += verified_matches(rig, features, near, ratio=options.ratio)
+    return _joined(rig, parts, evidence, options)
+
+
+def choose_pairs(rig: Rig, *, neighbours: int) -> list[tuple[str, str]]:
+    """For each camera the `neighbours` that share most of its view under an angle that SIFT bears; by rig order."""
+    centre = np.array(check_rig(rig).scene_centre)
+    shared = _shared_views(rig, centre)
+    towards = rig.centres - centre
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    angle_deg = np.degrees(np.arccos(np.clip(towards @ towards.T, -1, 1)))
+    # SIFT tolerates about 30 degrees; below 3 the depth of a match is a guess.
+    score = shared * np.exp(-((angle_deg / 40) ** 2)) * np.minimum(angle_deg / 3, 1)
+    np.fill_diagonal(score, -1)
+    best = np.argsort(-score, axis=1, kind="stable")[:, :neighbours]
+    chosen = {(min(a, b), max(a, b)) for a, row in enumerate(best) for b in row.tolist() if score[a, b] > 0}
+    return [(rig.names[a], rig.names[b]) for a, b in sorted(chosen)]
+
+
+def verified_matches(
+    rig: Rig, features: Mapping[str, Features], pairs: Sequence[tuple[str, str]], *, ratio: float
+) -> list[PairMatches]:
+    """Matches that agree on some epipolar geometry, found without the poses: what judges them."""
+    found = []
+    for first, second in pairs:
+        rows, _ = match(features[first], features[second], ratio=ratio)
+        if len(rows) < 8:
+            continue
+        a, b = features[first].pixels[rows[:, 0]], features[second].pixels[rows[:, 1]]
+        flat = [_undistorted(rig[name], pixels) for name, pixels in ((first, a), (second, b))]
+        _, mask = cv2.findFundamentalMat(flat[0], flat[1], cv2.USAC_MAGSAC, 2.0, 0.999, 10_000)
+        if mask is not None:
+            kept = mask.ravel().astype(bool)
+            found.append(PairMatches(first, second, a[kept], b[kept]))
+    return found
+
+
+def detect_all(rig: Rig, pictures: Mapping[str, np.ndarray], *, options: FeatureOptions) -> dict[str, Features]:
+    """Features of each camera's picture, in the order of the rig; raises ValueError for pictures that do not fit it."""
+    _check_pictures(rig, pictures)
+    return {name: detect(pictures[name], options=options) for name in rig.names if name in pictures}
+
+
+def _check_pictures(rig: Rig, pictures: Mapping[str, np.ndarray]) -> None:
+    strangers = sorted(set(pictures) - set(rig.names))
+    if strangers:
+        raise ValueError(f"pictures must be of the rig's cameras {list(rig.names)}, but there are also {strangers}")
+    for name, picture in pictures.items():
+        expected = (rig[name].height, rig[name].width, 3)
+        if picture.shape != expected or picture.dtype != np.uint8:
+            raise ValueError(
+                f"camera {name!r} needs uint8 pictures {expected}, but got {picture.dtype} {picture.shape}"
+            )
+
+
+def _shared_views(rig: Rig, centre: np.ndarray) -> np.ndarray:
+    """Share of what camera a films, near the centre and behind it, that camera b films too; lesser of both ways."""
+    grid = (np.stack(np.meshgrid(np.arange(8), np.arange(8)), axis=-1).reshape(-1, 2) + 0.5) / 8  # [64, 2]
+    share = np.zeros((len(rig.cameras), len(rig.cameras)))
+    for row, camera in enumerate(rig.cameras):
+        plane = camera.plane_from_pixels(grid * (camera.width, camera.height))
+        rays = np.hstack([plane, np.ones((len(plane), 1))]) @ camera.camera_from_world[:3, :3]
+        distance = np.linalg.norm(camera.centre - centre)
+        points = np.concatenate([camera.centre + distance * depth * rays for depth in (0.7, 1.0, 1.5, 2.0)])
+        share[row] = [other.sees(points).mean() for other in rig.cameras]
+    return np.minimum(share, share.T)
+
+
+def _undistorted(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    return camera.plane_from_pixels(pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+# Matches and tracks
+
+
+def _link(rig: Rig, first: str, second: str, features: Mapping[str, Features], options: TriangulateOptions) -> Link:
+    """Matches of two cameras near each other's epipolar lines."""
+    a, b = features[first], features[second]
+    band = _epipolar_band(rig[first], rig[second], a, b, options.epipolar_px)
+    rows, distances = match(a, b, ratio=options.ratio, band=band)
+    places = np.stack([a.places[rows[:, 0]], b.places[rows[:, 1]]], axis=1)
+    return Link(rig.names.index(first), rig.names.index(second), places, distances)
+
+
+def _epipolar_band(first: Camera, second: Camera, a: Features, b: Features, limit_px: float) -> Band:
+    rays_a, rays_b = _rays(first, a), _rays(second, b)
+    matrix = essential(first, second)
+    lines_b, lines_a = rays_a @ matrix.T, rays_b @ matrix  # [N, 3] in second, [M, 3] in first
+    return Band(
+        lines_b, rays_b, limit_px * np.linalg.norm(lines_b[:, :2] / (second.fx, second.fy), axis=1),
+        limit_px * np.linalg.norm(lines_a[:, :2] / (first.fx, first.fy), axis=1),
+    )  # fmt: skip
+
+
+def _rays(camera: Camera, features: Features) -> np.ndarray:
+    return np.hstack([camera.plane_from_pixels(features.pixels), np.ones((len(features.pixels), 1))])  # [N, 3]
+
+
+def _sightings(
+    rig: Rig, features: Mapping[str, Features], pairs: Sequence[tuple[str, str]], options: TriangulateOptions
+) -> Sightings:
+    links = [_link(rig, first, second, features, options) for first, second in pairs]
+    number = {name: index for index, name in enumerate(rig.names)}
+    counts = {number[name]: int(found.places.max(initial=-1)) + 1 for name, found in features.items()}
+    point, camera, place = chain(links, counts, min_views=options.min_views)
+    pixels = np.zeros((len(point), 2))
+    for name, found in features.items():
+        mine = camera == number[name]
+        first_there = np.unique(found.places, return_index=True)[1]
+        pixels[mine] = found.pixels[first_there[place[mine]]]
+    return Sightings(point, camera, pixels)
+
+
+# Colours and the result
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The points of one instant."""
+
+    sightings: Sightings
+    xyz: np.ndarray
+    errors_px: np.ndarray
+    light: np.ndarray
+    clean: np.ndarray
+
+
+def _part(
+    rig: Rig,
+    pictures: Mapping[str, np.ndarray],
+    features: Mapping[str, Features],
+    pairs: Sequence[tuple[str, str]],
+    options: TriangulateOptions,
+) -> _Part:
+    sightings, xyz, errors = locate(
+        rig, _sightings(rig, features, pairs, options), max_error_px=options.max_error_px,
+        min_views=options.min_views, min_angle_deg=options.min_angle_deg,
+    )  # fmt: skip
+    light, clean = np.zeros((len(errors), 3), np.float32), np.zeros(len(errors), bool)
+    for index, name in enumerate(rig.names):
+        mine = sightings.camera == index
+        if mine.any():
+            light[mine], clean[mine] = patch_light(pictures[name], sightings.pixels[mine], side_px=options.patch_px)
+    return _Part(sightings, xyz, errors, light, clean)
+
+
+def patch_light(picture: np.ndarray, pixels: np.ndarray, *, side_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean linear light of the square about each pixel [N, 2], float32 [N, 3], and whether none of it is clipped.
+
+    `picture` is uint8 RGB. Values below 4 or above 250 count as clipped: what they hide would bend a gain.
+    """
+    size = (side_px, side_px)
+    mean = cv2.blur(_LINEAR[picture], size, borderType=cv2.BORDER_REPLICATE)
+    clipped = ((picture < 4) | (picture > 250)).any(axis=2)
+    spread = cv2.blur(np.asarray(clipped, dtype=np.float32), size, borderType=cv2.BORDER_REPLICATE)
+    column = np.clip(pixels[:, 0].astype(int), 0, picture.shape[1] - 1)
+    row = np.clip(pixels[:, 1].astype(int), 0, picture.shape[0] - 1)
+    return mean[row, column], spread[row, column] < 0.5 / side_px**2
+
+
+def _joined(
+    rig: Rig, parts: Sequence[_Part], evidence: Sequence[PairMatches], options: TriangulateOptions
+) -> SparsePoints:
+    counts = [len(part.xyz) for part in parts]
+    if not sum(counts):
+        raise ValueError(
+            f"pictures of {len(rig.cameras)} cameras must share points, but none was found in {len(parts)} instants; "
+            f"check that the calibration belongs to these videos and that they are synchronized"
+        )
+    before = np.cumsum([0, *counts[:-1]])
+    point = np.concatenate([part.sightings.point + start for part, start in zip(parts, before, strict=True)])
+    camera = np.concatenate([part.sightings.camera for part in parts])
+    pixels = np.concatenate([part.sightings.pixels for part in parts])
+    errors = np.concatenate([part.errors_px for part in parts])
+    light, clean = np.concatenate([part.light for part in parts]), np.concatenate([part.clean for part in parts])
+    whole = Sightings(point.astype(np.int32), camera, pixels)
+    return SparsePoints(
+        rig.names, np.concatenate([part.xyz for part in parts]), _srgb(medians(light, whole.point)), whole.views,
+        np.sqrt(np.add.reduceat(errors**2, whole.starts) / whole.views).astype(np.float32),
+        np.repeat(np.arange(len(parts)), counts).astype(np.int32), whole.point, whole.camera,
+        _undistorted_all(rig, whole), np.where(clean[:, None], light, np.float32(np.nan)),
+        matches_report(rig, evidence, errors_px=errors, options=options.judge),
+    )  # fmt: skip
+
+
+def _undistorted_all(rig: Rig, sightings: Sightings) -> np.ndarray:
+    flat = np.zeros_like(sightings.pixels)
+    for index, camera in enumerate(rig.cameras):
+        mine = sightings.camera == index
+        flat[mine] = _undistorted(camera, sightings.pixels[mine])
+    return flat.astype(np.float32)
+
+
+def _srgb(light: np.ndarray) -> np.ndarray:
+    """Linear light in [0, 1] to 8-bit sRGB."""
+    curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.rint(np.clip(curved, 0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,262 @@
+"""The `packuv` command.
+
+Exit code 0: done; 1: the run failed; 2: wrong usage or bad input, with one sentence on stderr; 130: stopped by Ctrl-C.
+Nothing heavy is imported before a command is chosen, so that `packuv --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import re
+import signal
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from pipelines.request import PRESETS, STAGES
+
+OK, FAILED, WRONG, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+SINGLE = {
+    "sync": "match the frames of all cameras to instants",
+    "calibrate": "import or solve the cameras, triangulate points, balance colours",
+    "flow": "find out what moves, and choose keyframes",
+    "fit": "fit Gaussians to the keyframes, then to the frames between them",
+    "encode": "write the scene file",
+}
+"""Commands that run the stages up to the one they name"""
+BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+
+
+class UsageError(ValueError):
+    """The command line cannot be understood."""
+
+
+class Terminated(BaseException):
+    """SIGTERM came."""
+
+
+class _Help(argparse.HelpFormatter):
+    """Shows the defaults that say something; a range or size explains its own."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=28)
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        default = action.default
+        shown = isinstance(default, (str, int)) and not isinstance(default, bool) and default != argparse.SUPPRESS
+        return f"{action.help} (default: %(default)s)" if shown and action.option_strings else action.help
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one sentence, without the usage text."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(allow_abbrev=False, formatter_class=_Help, **settings)
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message}; see {self.prog} --help")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the `packuv` command with these arguments, by default those of the process; returns the exit code."""
+    try:
+        arguments = parser().parse_args(argv)
+        _end_gently_on_sigterm()
+        return _load(arguments.function)(arguments)
+    except BAD_INPUT as error:
+        return _say(WRONG, error)
+    except KeyboardInterrupt:
+        return _say(INTERRUPTED, "stopped; the same command goes on from here")
+    except Terminated:
+        return _say(TERMINATED, "ended by SIGTERM; the same command goes on from here")
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # `packuv info SCENE | head` is no failure
+        return OK
+    except Exception as error:
+        return _say(FAILED, f"{_first_sentence(error)}; the traceback is in {_write_log(error)}")
+
+
+def _load(name: str) -> Callable[[argparse.Namespace], int]:
+    module, _, function = name.partition(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def _end_gently_on_sigterm() -> None:
+    def end(number: int, frame: object) -> None:
+        raise Terminated
+
+    signal.signal(signal.SIGTERM, end)
+
+
+def _say(code: int, problem: object) -> int:
+    """One line on stderr."""
+    print(f"packuv: {' '.join(str(problem).split())}", file=sys.stderr)
+    return code
+
+
+def _first_sentence(error: Exception) -> str:
+    return str(error).split("; the traceback is in ")[0] or type(error).__name__
+
+
+def _write_log(error: Exception) -> Path:
+    """The file with the traceback: the job's own log where a job failed."""
+    log = getattr(error, "log", None)
+    if log is not None:
+        return log
+    with tempfile.NamedTemporaryFile("w", prefix="packuv-", suffix=".log", delete=False) as file:
+        traceback.print_exception(error, file=file)
+        return Path(file.name)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The grammar of the command line."""
+    top = _Parser(prog="packuv", description="From a multi-camera capture to a volumetric video.")
+    commands = top.add_subparsers(metavar="COMMAND", required=True)
+
+    def command(name: str, function: str, text: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        added.set_defaults(function=function, command=name)
+        return added
+
+    _simulate(command("simulate", "pipelines.commands:simulate", "write a synthetic capture with exact ground truth"))
+    _run(command("run", "pipelines.run:command", "turn a capture folder into a scene file, with report"), stop=True)
+    for name, text in SINGLE.items():
+        _run(command(name, "pipelines.run:command", f"{text} (run --stop-after {name})"), stop=False)
+    _scene(command("info", "pipelines.commands:info", "show what a scene file holds"), json=True)
+    _verify(command("verify", "pipelines.commands:verify", "check a scene file bit by bit, or the artefacts of a run"))
+    _export(command("export", "pipelines.commands:export", "write one frame for other splat programs"))
+    _render(command("render", "pipelines.commands:render", "write pictures of a scene as PNG files"))
+    _evaluate(command("eval", "pipelines.commands:evaluate", "score a scene against a capture"))
+    _view(command("view", "pipelines.commands:view", "show a scene in the web browser"))
+    command("doctor", "pipelines.commands:doctor", "tell what this machine has and lacks")
+    return top
+
+
+def _simulate(command: argparse.ArgumentParser) -> None:
+    command.add_argument("out", type=Path, metavar="OUT", help="folder to write, new or empty")
+    command.add_argument("--cameras", type=_positive, default=8, help="number of cameras")
+    command.add_argument("--frames", type=_positive, default=24, help="number of instants")
+    command.add_argument("--size", type=_size, default=(640, 360), metavar="WxH", help="picture size, pixels (640x360)")
+    command.add_argument("--fps", type=str, default="30", help="instants per second, a number or a fraction")
+    command.add_argument("--rig", choices=("ring", "dome", "front"), default="ring", help="how the cameras stand")
+    _seed(command)
+    _set(command, "a setting of the simulation")
+
+
+def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
+    command.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/")
+    command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
+    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what fits and renders")
+    command.add_argument(
+        "--frames", type=_range, default=(0, None), metavar="A:B", help="instants A to B - 1, counted from 0 (all)"
+    )
+    command.add_argument(
+        "--hold-out",
+        type=_names,
+        default=None,
+        metavar="CAM,CAM",
+        help="cameras to score on, never fitted (capture.toml)",
+    )
+    if stop:
+        command.add_argument("--stop-after", choices=STAGES, default="report", metavar="STAGE", help=", ".join(STAGES))
+    command.add_argument("--jobs", type=_positive, default=None, metavar="N", help="segments at once (from the cores)")
+    command.add_argument("--direct", action="store_true", help="run the same stages without the workflow engine")
+    command.add_argument("--config", type=Path, default=None, metavar="FILE", help="TOML file with settings by stage")
+    _seed(command)
+    _set(command, "a setting of a stage; wins over --config and --preset")
+    _json(command)
+
+
+def _scene(command: argparse.ArgumentParser, *, json: bool = False) -> None:
+    command.add_argument("scene", type=Path, metavar="SCENE", help="scene file")
+    if json:
+        _json(command)
+
+
+def _verify(command: argparse.ArgumentParser) -> None:
+    what = command.add_mutually_exclusive_group(required=True)
+    what.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help="scene file: decode and compare every frame")
+    what.add_argument(
+        "--store", type=Path, metavar="DIR", help="folder of a run: compare every artefact with its receipt"
+    )
+    _json(command)
+
+
+def _export(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    command.add_argument("--frame", type=int, required=True, metavar="N", help="frame, counted from 0")
+    command.add_argument("--format", choices=("ply",), default="ply", help="ply: standard 3D Gaussian Splatting")
+    command.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
+
+
+def _render(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    command.add_argument("--camera", required=True, metavar="NAME|FILE", help="a camera of the scene, or a JSON file")
+    command.add_argument("--frames", type=_range, default=(0, None), metavar="A:B", help="frames A to B - 1 (all)")
+    command.add_argument("--size", type=_size, default=None, metavar="WxH", help="picture size, pixels (the camera's)")
+    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
+    command.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for 000000.png, ...")
+
+
+def _evaluate(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    command.add_argument("capture", type=Path, metavar="CAPTURE", help="the capture folder it was made from")
+    command.add_argument(
+        "--cameras", type=_names, default=None, metavar="a,b", help="cameras (those held out, or three)"
+    )
+    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
+    _json(command)
+
+
+def _view(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    command.add_argument("--port", type=int, default=8787, help="TCP port on localhost; 0 picks a free one")
+
+
+def _seed(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--seed", type=int, default=0, help="same seed, same bytes")
+
+
+def _set(command: argparse.ArgumentParser, text: str) -> None:
+    command.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+
+
+def _json(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--json", action="store_true", help="print JSON on stdout, and nothing else there")
+
+
+def _positive(text: str) -> int:
+    number = int(text) if re.fullmatch(r"\d+", text) else 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 on, but is {text!r}")
+    return number
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT in pixels, as 640x360, but is {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def _range(text: str) -> tuple[int, int | None]:
+    """Half-open; either end may be missing."""
+    match = re.fullmatch(r"(\d*):(\d*)", text)
+    first, stop = (int(part) if part else None for part in match.groups()) if match else (None, None)
+    if not match or (stop is not None and stop <= (first or 0)):
+        raise argparse.ArgumentTypeError(f"must be A:B with A < B, as 0:30 for the first thirty, but is {text!r}")
+    return first or 0, stop
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+"""Every setting of a sequence, by stage, and the presets that trade time for quality."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from packuv.keyframes import KeyframeOptions
+from packuv.motion import MotionOptions
+from packuv.solver import FitOptions
+from pipelines.request import PRESETS
+from sync.align import AlignOptions
+from sync.capture import CaptureSettings
+from tasks.calibrate import PointOptions, RigOptions
+from tasks.evaluate import EvaluateOptions
+from tasks.footage import PictureOptions
+from tasks.recipe import override
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """Settings by stage; a stage's artefacts depend on its own and on those of the stages before it."""
+
+    pictures: PictureOptions = field(default_factory=PictureOptions)
+    sync: AlignOptions = field(default_factory=AlignOptions)
+    rig: RigOptions = field(default_factory=RigOptions)
+    points: PointOptions = field(default_factory=PointOptions)
+    motion: MotionOptions = field(default_factory=MotionOptions)
+    keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
+    fit: FitOptions = field(default_factory=FitOptions)
+    evaluate: EvaluateOptions = field(default_factory=EvaluateOptions)
+
+
+_PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "draft": {
+        "pictures": {"max_width": 640},
+        "fit": {"iterations": 2500, "key_iterations": 700, "frame_iterations": 72},
+    },
+    "standard": {
+        "pictures": {"max_width": 1280},
+        "fit": {"iterations": 5000, "key_iterations": 1500, "frame_iterations": 150},
+    },
+    "high": {
+        "fit": {"iterations": 15000, "key_iterations": 4000, "frame_iterations": 400, "sh_degree": 3},
+    },
+}
+assert tuple(_PRESETS) == PRESETS
+
+
+def compose(preset: str, capture: CaptureSettings, settings: Mapping[str, Any], *, seed: int = 0) -> SequenceOptions:
+    """Options of a run: the preset's, then what capture.toml says, then the user's settings.
+
+    Raises OptionError that names an unknown setting, with the valid names, or a value of the wrong kind.
+    """
+    options = override(SequenceOptions(), _PRESETS[preset])
+    options = override(options, {"sync": {"reference": capture.reference, "clock": capture.clock}})
+    return override(override(options, {"fit": {"seed": seed}}), settings)

@@ -1,0 +1,146 @@
+"""Processing one sequence: from what the user asks for to results where people find them."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pipelines.options import compose
+from pipelines.progress import Event, TerminalProgress
+from pipelines.request import RunRequest
+from pipelines.results import Run, collect, run_json
+from pipelines.stages import Made, Submit, run_stages
+from sync.capture import Capture, find_capture
+from tasks.encode import SCENE
+from tasks.jobs import Jobs
+from tasks.plan import Plan
+from tasks.report import write_report
+from tasks.report_facts import summary
+from tasks.store import Store, write_json
+from tasks.workshop import Workshop
+
+RUN = "run.json"
+CORES_PER_JOB = 4
+"""A fit's threads wait for each other often enough that a big machine is better used by several fits side by side"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where the results of a run are."""
+
+    folder: Path
+    """<out>/<sequence>"""
+    scene: Path | None
+    report: Path
+    figures: Mapping[str, Any]
+    """The report's summary: PSNR, SSIM, size, time; None where there is none"""
+    events: tuple[Event, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """For `packuv run --json`."""
+        return {
+            "folder": str(self.folder),
+            "scene": self.scene and str(self.scene),
+            "report": str(self.report),
+            "summary": dict(self.figures),
+            "stages": [event.to_json() for event in self.events],
+        }
+
+    def farewell(self) -> str:
+        """The last lines of a run."""
+        lines = [*_quality(self.figures), f"results    {self.folder}"]
+        if self.scene:
+            lines.append(f"scene      {self.scene}")
+        lines.append(f"report     {self.report}")
+        if self.scene:
+            lines.append(f"view it    {shlex.join(['packuv', 'view', str(self.scene)])}")
+        return "\n".join(lines)
+
+
+def _quality(figures: Mapping[str, Any]) -> Iterator[str]:
+    if figures["psnr_db"] is not None:
+        cameras = ", ".join(figures["scored_cameras"])
+        unseen = "never fitted" if figures["held_out"] else "fitted"
+        yield f"quality    {figures['psnr_db']:.2f} dB, SSIM {figures['ssim']:.4f} on {cameras} ({unseen})"
+    if figures["mb_per_30_frames"] is not None:
+        yield f"size       {figures['mb_per_30_frames']:.2f} MB per 30 frames"
+
+
+def process_directly(request: RunRequest, progress: TerminalProgress) -> Outcome:
+    """Process a sequence in this process and its jobs, without the workflow engine."""
+    with ThreadPoolExecutor(max_workers=jobs_at_once(request)) as pool:
+        return process(request, progress, pool.submit)
+
+
+def process(request: RunRequest, progress: TerminalProgress, submit: Submit) -> Outcome:
+    """Process a sequence by stages that `submit` starts.
+
+    Raises ValueError or FileNotFoundError for bad input, OSError when the disk cannot hold the results, and what a
+    failing stage raises. Whatever ends the run, no job goes on after it.
+    """
+    started = datetime.now(UTC)
+    capture = find_capture(Path(request.capture))
+    options = compose(request.preset, capture.settings, request.settings, seed=request.seed)
+    plan = plan_of(request, capture)
+    folder = Path(request.out).absolute() / capture.name
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = Jobs(threads=max(1, _cores() // jobs_at_once(request)))
+    workshop = Workshop(Store(folder / "store"), jobs, progress)
+    run = Run(folder.name, request, options, plan, workshop, progress, started, Made())
+    try:
+        run_stages(workshop, plan, options, request.stop_after, submit, run.made)
+        return _publish(run, folder)
+    except BaseException:
+        jobs.cancel()
+        raise
+    finally:
+        write_json(folder / RUN, run_json(run))
+
+
+def plan_of(request: RunRequest, capture: Capture) -> Plan:
+    """What the request means for this capture; raises ValueError for cameras that it lacks or a missing GPU."""
+    if request.device == "cuda":
+        raise ValueError("this version fits on the CPU only; use --device auto or cpu")
+    first, stop = request.frames
+    held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
+    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, "cpu", request.seed)
+
+
+def jobs_at_once(request: RunRequest) -> int:
+    """Stages that may run side by side."""
+    return request.jobs or max(1, _cores() // CORES_PER_JOB)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _publish(run: Run, folder: Path) -> Outcome:
+    """Put the scene file and the report into the sequence's folder."""
+    scene = None
+    if key := run.made.get("encode"):
+        scene = folder / SCENE
+        place(run.workshop.path(key) / SCENE, scene)
+    run.progress.started("report")
+    content = collect(run)
+    report = write_report(content, folder)
+    run.progress.ended("report")
+    return Outcome(folder, scene, report.page, summary(content), tuple(run.progress.events))
+
+
+def place(source: Path, target: Path) -> None:
+    """Give an artefact's file a second name, or a copy where the file system has no links; never half a file."""
+    part = target.with_name(f".{target.name}.part")
+    part.unlink(missing_ok=True)
+    try:
+        os.link(source, part)
+    except OSError:
+        shutil.copyfile(source, part)
+    os.replace(part, target)

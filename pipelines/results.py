@@ -1,0 +1,144 @@
+"""What a run leaves for people and programs: run.json, and the input of the report."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import socket
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.accept import RigReport
+from calibration.rig import Rig
+from packuv.scene import open_scene
+from pipelines.options import SequenceOptions
+from pipelines.progress import Event, TerminalProgress
+from pipelines.request import RunRequest
+from pipelines.stages import Made
+from sync.align import SyncReport
+from tasks.calibrate import CHECK
+from tasks.encode import SCENE
+from tasks.evaluate import PICTURES, TABLE, frame_scores, read_table
+from tasks.footage import RIG
+from tasks.plan import Plan
+from tasks.recipe import plain
+from tasks.report_facts import Comparison, MotionCurve, ReportInput, SceneFigures, StageRecord, scene_figures
+from tasks.store import Store
+from tasks.track import read_curve, read_keyframes
+from tasks.workshop import Workshop
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run and what it has made so far."""
+
+    name: str
+    """Of the sequence"""
+    request: RunRequest
+    options: SequenceOptions
+    plan: Plan
+    workshop: Workshop
+    progress: TerminalProgress
+    started: datetime
+    made: Made
+
+    def folder(self, stage: str) -> Path | None:
+        """Folder of the first artefact of a stage, or None if the run did not come to it."""
+        key = self.made.get(stage)
+        return self.workshop.path(key) if key else None
+
+
+def run_json(run: Run) -> dict[str, Any]:
+    """Which artefacts with which options, what was skipped and why, and how long it took; also of a failed run."""
+    events = run.progress.events
+    return {
+        "sequence": run.name,
+        "packuv": version("packuv"),
+        "command": shlex.join(sys.argv),
+        "started": run.started.isoformat(timespec="seconds"),
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "request": plain(run.request),
+        "options": plain(run.options),
+        "cameras": {"fitted": run.plan.fitted, "held_out": run.plan.held_out},
+        "stages": [event.to_json() for event in events],
+        "skipped": [{"what": event.label, "why": event.reason} for event in events if event.outcome == "skipped"],
+        "artefacts": [_artefact(run.workshop.store, key) for keys in run.made.keys.values() for key in keys],
+    }
+
+
+def _artefact(store: Store, key: Any) -> dict[str, Any]:
+    receipt = store.receipt(key)
+    return {
+        "artefact": str(key),
+        "seconds": receipt.seconds,
+        "peak_memory_bytes": receipt.peak_memory_bytes,
+        "bytes": receipt.size_bytes,
+        "finished": receipt.finished,
+        "notes": receipt.notes,
+    }
+
+
+def collect(run: Run) -> ReportInput:
+    """What the stages left, for the report; parts that the run did not come to are missing."""
+    now = datetime.now(UTC)
+    rig_folder, sync_folder = run.folder("points") or run.folder("rig"), run.folder("sync")
+    return ReportInput(
+        name=run.name,
+        command=shlex.join(sys.argv),
+        options=run.options,
+        versions={"packuv": version("packuv"), "python": sys.version.split()[0]},
+        host=f"{socket.gethostname()}, {run.workshop.jobs.threads} threads a job, {run.plan.device}",
+        finished=now.isoformat(timespec="seconds"),
+        seconds=(now - run.started).total_seconds(),
+        sync=SyncReport.load(sync_folder) if sync_folder else None,
+        rig=Rig.load(rig_folder / RIG) if rig_folder else None,
+        held_out=run.plan.held_out,
+        check=_check(run.folder("rig")),
+        motion=_curve(run.folder("keyframes")),
+        scores=_scores(run.folder("evaluate")),
+        scene=_scene(run),
+        pictures=tuple(_pictures(run.folder("evaluate"))),
+        stages=tuple(_stage(run.workshop.store, event) for event in run.progress.events),
+    )
+
+
+def _check(folder: Path | None) -> RigReport | None:
+    if folder is None:
+        return None
+    return RigReport(**json.loads((folder / CHECK).read_text()))
+
+
+def _curve(folder: Path | None) -> MotionCurve | None:
+    return MotionCurve(np.array(read_curve(folder)), tuple(read_keyframes(folder))) if folder else None
+
+
+def _scores(folder: Path | None) -> tuple[Any, ...]:
+    return frame_scores(read_table(folder / TABLE)) if folder else ()
+
+
+def _scene(run: Run) -> SceneFigures | None:
+    folder = run.folder("encode")
+    if folder is None:
+        return None
+    with open_scene(folder / SCENE) as scene:
+        return scene_figures(scene, verified=True if run.folder("verify") else None)
+
+
+def _pictures(folder: Path | None) -> Iterator[Comparison]:
+    if folder is None:
+        return
+    inside = folder / PICTURES
+    for item in json.loads((inside / "index.json").read_text())["pictures"]:
+        yield Comparison(item["camera"], item["frame"], inside / item["truth"], inside / item["render"], item["choice"])
+
+
+def _stage(store: Store, event: Event) -> StageRecord:
+    memory = store.receipt(event.key).peak_memory_bytes if event.key else None
+    return StageRecord(event.label, event.outcome, event.seconds, memory, event.reason)  # type: ignore[arg-type]

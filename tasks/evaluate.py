@@ -1,0 +1,305 @@
+"""Evaluate: how close a scene's pictures are to what cameras filmed, above all those that were never fitted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+
+from packuv.camera import PinholeCamera
+from packuv.files import write_json
+from packuv.frames import LensCamera, Views
+from packuv.metrics import psnr, ssim
+from packuv.quantize import Gaussians
+from packuv.raster import RasterOptions, Workspace, render
+from packuv.scene import Scene, open_scene
+from sync.align import AlignOptions, FrameGroups, align
+from sync.capture import find_capture, load_timecodes
+from sync.clock import ClockMode
+from sync.probe import probe_video
+from tasks.encode import SCENE
+from tasks.footage import Footage, PictureOptions
+from tasks.jobs import Progress
+from tasks.plan import Plan
+from tasks.report_facts import FrameScore, frames_to_picture
+from tasks.store import Key
+from tasks.workshop import Workshop
+
+VERSION = 1
+METRICS, TABLE, PICTURES = "metrics.json", "metrics.arrow", "pictures"
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """Which cameras are scored where none is held out."""
+
+    fitted_cameras: int = 3
+    """Fitted cameras to score, spread over the rig, where no camera is held out"""
+
+    def __post_init__(self) -> None:
+        if self.fitted_cameras < 1:
+            raise ValueError(f"evaluation needs at least one camera, but fitted_cameras is {self.fitted_cameras}")
+
+
+@dataclass(frozen=True)
+class Score:
+    """One picture against its truth. PSNR in dB; None where the two are equal."""
+
+    frame: int
+    time_ns: int
+    camera: str
+    held_out: bool
+    psnr_db: float | None
+    """Against the picture as filmed"""
+    ssim: float
+    psnr_rig_db: float | None
+    """Against the picture in the rig's common colour, as the fit sees it"""
+    ssim_rig: float
+    psnr_own_db: float | None
+    """Against the picture as filmed, the render with the one gain per channel that fits this picture best"""
+    ssim_own: float
+
+
+SCHEMA = pa.schema(
+    [("frame", pa.int32()), ("time_ns", pa.int64()), ("camera", pa.string()), ("held_out", pa.bool_())]
+    + [(name, pa.float64()) for kind in ("", "_rig", "_own") for name in (f"psnr{kind}_db", f"ssim{kind}")]
+)  # fmt: skip
+
+
+def evaluate(
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    points: Key,
+    scene: Key,
+    pictures: PictureOptions,
+    options: EvaluateOptions,
+) -> Key:
+    """Score every frame of the scene file on the held-out cameras: metrics.json, metrics.arrow, pictures/."""
+    cameras = plan.held_out or spread(plan.fitted, options.fitted_cameras)
+    if not plan.held_out:
+        workshop.listener.skipped("unseen scores", f"no camera is held out; scored on fitted {', '.join(cameras)}")
+    arguments = {
+        "footage": Footage(
+            plan.capture,
+            workshop.path(groups),
+            workshop.path(points),
+            cameras,
+            plan.first,
+            plan.stop,
+            pictures.max_width,
+        ),
+        "scene": workshop.path(scene) / SCENE,
+        "options": options,
+    }
+    reads = {"evaluate": options, "pictures": pictures, "cameras": cameras, "first": plan.first}
+    inputs = {"groups": groups, "points": points, "scene": scene}
+    return workshop.make("evaluate", VERSION, reads, inputs, "tasks.evaluate:build", arguments)
+
+
+def build(footage: Footage, scene: Path, options: EvaluateOptions, out: Path, progress: Progress) -> dict[str, Any]:
+    """The job behind `evaluate`."""
+    views = footage.open_views()
+    with open_scene(scene) as opened:
+        scores = score(opened, views, progress)
+        write_table(out / TABLE, scores)
+        write_pictures(out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
+        facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size)
+    write_json(out / METRICS, facts)
+    return {name: facts[name] for name in ("cameras", "held_out", "mean")}
+
+
+def evaluate_scene(
+    scene: Path, capture: Path, cameras: Sequence[str] | None, options: EvaluateOptions, progress: Progress
+) -> dict[str, Any]:
+    """Score a scene file against a capture folder, without a store; the summary that `evaluate` writes.
+
+    The frames of the capture are matched again as the scene's header says, and found by their times. Raises
+    ValueError for a camera that the scene does not know, or a capture that did not film the scene's instants.
+    """
+    with open_scene(scene) as opened:
+        header = opened.header
+        lenses = {item["name"]: LensCamera.from_json(item) for item in header.extra["lenses"]}
+        fitted = [name for name in lenses if name not in header.held_out]
+        names = tuple(cameras or header.held_out) or spread(fitted, options.fitted_cameras)
+        if unknown := [name for name in names if name not in lenses]:
+            raise ValueError(f"the scene has no camera {', '.join(unknown)}; it has {', '.join(lenses)}")
+        groups = _matched(capture, header.sync)
+        rows = _rows(groups, header.times_ns)
+        columns = [groups.cameras.index(name) for name in names]
+        frames = groups.frames[rows][:, columns]
+        width = header.extra["max_width"]
+        views = Views(find_capture(capture).videos, frames, [lenses[name] for name in names], max_width=width)
+        scores = score(opened, views, progress)
+        return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size)
+
+
+def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
+    found = find_capture(capture)
+    infos = {camera: probe_video(path) for camera, path in found.videos.items()}
+    options = AlignOptions(
+        reference=sync["reference"], tolerance_ns=sync["tolerance_ns"], clock=ClockMode(sync["clock"])
+    )
+    return align(load_timecodes(found, infos), options)[0]
+
+
+def _rows(groups: FrameGroups, times_ns: np.ndarray) -> np.ndarray:
+    """Rows of the groups that were filmed at these times."""
+    rows = np.searchsorted(groups.times_ns, times_ns)
+    if (rows >= len(groups)).any() or (groups.times_ns[np.minimum(rows, len(groups) - 1)] != times_ns).any():
+        raise ValueError("the capture did not film the scene's instants; is it the one that the scene was made from?")
+    return rows
+
+
+def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
+    """Score every frame on all cameras of the views, whose instant i is frame i of the scene.
+
+    A camera without a picture at an instant is not scored there.
+    """
+    artist, scores = Artist(scene), []
+    for frame in range(len(scene)):
+        gaussians = scene.gaussians(frame)
+        for index, camera in enumerate(views.cameras):
+            pixels, balanced = views.pixels(index, frame), views.picture(index, frame)
+            if pixels is not None and balanced is not None:
+                truth = np.ascontiguousarray(pixels.transpose(2, 0, 1), dtype=np.float32) / 255
+                values = _compare(artist.draw(gaussians, camera), truth, balanced)
+                held_out = camera.name in scene.header.held_out
+                scores.append(Score(frame, int(scene.header.times_ns[frame]), camera.name, held_out, *values))
+        progress(frame + 1, len(scene), f"{_mean([s.psnr_rig_db for s in scores]) or 0:.2f} dB")
+    return scores
+
+
+def write_pictures(folder: Path, scene: Scene, views: Views, chosen: Sequence[tuple[str, int, str]]) -> None:
+    """Render and truth of chosen cameras and frames, in the rig's common colour; index.json says why each was."""
+    folder.mkdir()
+    artist, index = Artist(scene), []
+    for camera, frame, why in sorted(chosen, key=lambda choice: choice[1]):
+        place = views.names.index(camera)
+        truth = views.picture(place, frame)
+        if truth is None:
+            continue
+        names = {kind: f"{camera}_{frame:06d}_{kind}.png" for kind in ("render", "truth")}
+        write_picture(folder / names["render"], artist.draw(scene.gaussians(frame), views.cameras[place]))
+        write_picture(folder / names["truth"], truth)
+        index.append({"camera": camera, "frame": frame, "choice": why, **names})
+    write_json(folder / "index.json", {"pictures": index})
+
+
+class Artist:
+    """Draws Gaussians of a scene as its fit did."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._options = RasterOptions(near=float(scene.header.extra["near"]))
+        self._workspace = Workspace()
+
+    def draw(self, gaussians: Gaussians, camera: PinholeCamera) -> np.ndarray:
+        """float32 [3, H, W] in [0, 1], in the rig's common colour."""
+        rendering = render(gaussians, camera, options=self._options, workspace=self._workspace)
+        return np.clip(rendering.colour, 0, 1)
+
+
+def _compare(picture: np.ndarray, truth: np.ndarray, balanced: np.ndarray) -> list[Any]:
+    """The six figures of a `Score`."""
+    values: list[Any] = []
+    for first, second in ((picture, truth), (picture, balanced), (with_own_gain(picture, truth), truth)):
+        decibel = psnr(first, second)
+        values += [decibel if math.isfinite(decibel) else None, ssim(first, second)]
+    return values
+
+
+def with_own_gain(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The picture with one gain per channel in linear light that brings it nearest to the truth.
+
+    Both are float32 [3, H, W], sRGB. sRGB is (light ^ (1 / 2.4) * 1.055) - 0.055 but for the darkest tones, so a gain
+    is a factor on sRGB + 0.055, and least squares give that factor at once, in the scale on which PSNR counts.
+    """
+    shown, wanted = picture + np.float32(0.055), truth + np.float32(0.055)
+    factor = (shown * wanted).sum(axis=(1, 2)) / (shown * shown).sum(axis=(1, 2))
+    return _encoded(_linear(picture) * (factor**2.4)[:, None, None])
+
+
+def _linear(picture: np.ndarray) -> np.ndarray:
+    return np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
+
+
+def _encoded(light: np.ndarray) -> np.ndarray:
+    light = np.clip(light, 0, 1)
+    return np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def write_picture(path: Path, picture: np.ndarray) -> None:
+    """float32 [3, H, W] in [0, 1], RGB, as an 8-bit PNG; raises OSError if it cannot be written."""
+    pixels = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8).transpose(1, 2, 0)
+    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels[:, :, ::-1])):
+        raise OSError(f"cannot write {path}")
+
+
+def write_table(path: Path, scores: Sequence[Score]) -> None:
+    """One row per frame and camera."""
+    table = pa.Table.from_pylist([vars(item) for item in scores], schema=SCHEMA)
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_file(file, SCHEMA) as writer:
+        writer.write_table(table)
+
+
+def frame_scores(scores: Sequence[Score]) -> tuple[FrameScore, ...]:
+    """Scores in the rig's common colour, as the report shows them."""
+    return tuple(
+        FrameScore(item.camera, item.frame, math.inf if item.psnr_rig_db is None else item.psnr_rig_db, item.ssim_rig)
+        for item in scores
+    )
+
+
+def read_table(path: Path) -> tuple[Score, ...]:
+    """What `write_table` wrote."""
+    with pa.memory_map(str(path)) as source:
+        return tuple(Score(**row) for row in pa.ipc.open_file(source).read_all().to_pylist())
+
+
+def summary(scores: Sequence[Score], *, frames: int, size_bytes: int) -> dict[str, Any]:
+    """Means over the frames, per camera and over all, and the size of the scene file."""
+    names = list(dict.fromkeys(item.camera for item in scores))
+    return {
+        "frames": frames,
+        "cameras": names,
+        "held_out": all(item.held_out for item in scores),
+        "mean": _means(scores),
+        "by_camera": {name: _means([item for item in scores if item.camera == name]) for name in names},
+        "bytes": size_bytes,
+        "bytes_per_frame": size_bytes / frames,
+    }
+
+
+def _means(scores: Sequence[Score]) -> dict[str, float | None]:
+    return {name: _mean([getattr(item, name) for item in scores]) for name in SCHEMA.names[4:]}
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def spread(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """`count` of the names at equal distances; all of them if there are fewer.
+
+    >>> spread(["a", "b", "c", "d", "e", "f"], 3)
+    ('b', 'd', 'f')
+    """
+    if count >= len(names):
+        return tuple(names)
+    return tuple(names[(2 * place + 1) * len(names) // (2 * count)] for place in range(count))
+
+
+def frames_of(scene: Scene, first: int, stop: int | None) -> range:
+    """Frames of a half-open range; raises ValueError if the scene lacks any of them."""
+    chosen = range(first, len(scene) if stop is None else stop)
+    if not chosen or chosen.stop > len(scene):
+        asked = f"{first}:{'' if stop is None else stop}"
+        raise ValueError(f"the scene has frames 0 to {len(scene) - 1}, but {asked} are asked for")
+    return chosen

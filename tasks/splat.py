@@ -1,0 +1,202 @@
+"""Fit: the chain of keyframes, and the frames between them segment by segment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.rig import Rig
+from calibration.triangulate import SparsePoints
+from packuv import fit
+from packuv.files import write_json
+from packuv.fit import KeyState
+from packuv.frames import Views
+from packuv.motion import MotionCache, MotionOptions, changed_between
+from packuv.solver import FitOptions
+from packuv.start import Points, Sights
+from packuv.stream import hold_absent
+from tasks.calibrate import POINTS
+from tasks.footage import Footage, PictureOptions
+from tasks.jobs import Progress
+from tasks.plan import Plan
+from tasks.store import Key
+from tasks.track import MOTION
+from tasks.workshop import Workshop
+
+VERSION = 1
+SEGMENT = "segment.npz"
+SURE_VIEWS = 3
+"""Cameras that must see a point for Gaussians to start there; two may agree by chance"""
+
+
+def fit_first(
+    workshop: Workshop, plan: Plan, groups: Key, points: Key, pictures: PictureOptions, options: FitOptions
+) -> Key:
+    """Fit the first keyframe: state.npz and key.json, which holds the quantizer of the whole sequence."""
+    options = _without(options, "key_iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "labels")
+    arguments = {
+        "footage": _footage(workshop, plan, groups, points, pictures),
+        "points": workshop.path(points) / POINTS,
+        "options": options,
+    }
+    reads = _reads(plan, pictures, options)
+    inputs = {"groups": groups, "points": points}
+    return workshop.make("key", VERSION, reads, inputs, "tasks.splat:build_first", arguments, label="fit key 0")
+
+
+def fit_next(
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    points: Key,
+    previous: Key,
+    step: tuple[int, int],
+    pictures: PictureOptions,
+    motion: MotionOptions,
+    options: FitOptions,
+) -> Key:
+    """Fit the keyframe at instant `step[1]` from the one at `step[0]`."""
+    options = _without(options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift")
+    arguments = {
+        "footage": _footage(workshop, plan, groups, points, pictures),
+        "previous": workshop.path(previous),
+        "instant": step[1],
+        "motion": motion,
+        "options": options,
+    }
+    reads = {**_reads(plan, pictures, options), "motion": motion, "step": step}
+    inputs = {"groups": groups, "points": points, "previous": previous}
+    label = f"fit key {step[1]}"
+    return workshop.make("key", VERSION, reads, inputs, "tasks.splat:build_next", arguments, label=label)
+
+
+def fit_segment(
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    points: Key,
+    motion: Key,
+    key: Key,
+    span: range,
+    pictures: PictureOptions,
+    options: FitOptions,
+) -> Key:
+    """Fit the instants of a segment, which starts with its keyframe: segment.npz and fit.json."""
+    options = _without(options, "iterations", "key_iterations", "coarse_share", "float_share", "start")
+    arguments = {
+        "footage": _footage(workshop, plan, groups, points, pictures),
+        "key": workshop.path(key),
+        "motion": workshop.path(motion) / MOTION,
+        "span": (span.start, span.stop),
+        "options": options,
+    }
+    reads = {**_reads(plan, pictures, options), "span": (span.start, span.stop)}
+    inputs = {"groups": groups, "points": points, "motion": motion, "key": key}
+    label = f"fit {span.start}-{span.stop - 1}"
+    return workshop.make("segment", VERSION, reads, inputs, "tasks.splat:build_segment", arguments, label=label)
+
+
+def build_first(footage: Footage, points: Path, options: FitOptions, out: Path, progress: Progress) -> dict[str, Any]:
+    """The job behind `fit_first`."""
+    known, sights = _evidence(SparsePoints.load(points), footage.load_rig()) if points.exists() else (None, None)
+    state = fit.fit_first(
+        footage.open_views(), 0, points=known, sights=sights, options=options, progress=_counted(progress)
+    )
+    state.save(out)
+    return dict(state.figures)
+
+
+def build_next(
+    footage: Footage,
+    previous: Path,
+    instant: int,
+    motion: MotionOptions,
+    options: FitOptions,
+    out: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    """The job behind `fit_next`."""
+    views, before = footage.open_views(), KeyState.load(previous)
+    masks = _changes(views, before.instant, instant, motion)
+    state = fit.fit_next(before, views, instant, masks=masks, options=options, progress=_counted(progress))
+    state.save(out)
+    return dict(state.figures)
+
+
+def build_segment(
+    footage: Footage,
+    key: Path,
+    motion: Path,
+    span: tuple[int, int],
+    options: FitOptions,
+    out: Path,
+    scratch: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    """The job behind `fit_segment`."""
+    segment, figures = fit.fit_segment(
+        KeyState.load(key),
+        footage.open_views(),
+        range(*span),
+        motion=MotionCache.load(motion),
+        options=options,
+        scratch=scratch,
+        progress=_counted(progress),
+    )
+    hold_absent(segment).save(out / SEGMENT)
+    write_json(out / "fit.json", {"frames": figures})
+    return {"frames": len(segment), "gaussians": len(segment.key), "dynamic": int(segment.dynamic.sum())}
+
+
+def _evidence(sparse: SparsePoints, rig: Rig) -> tuple[Points, Sights]:
+    """Where surfaces surely are, and what cameras look through."""
+    sure = sparse.views >= SURE_VIEWS
+    centres = rig.select(sparse.cameras).centres  # [C, 3], world
+    return Points(sparse.xyz[sure], sparse.rgb[sure] / 255), Sights(centres[sparse.camera], sparse.xyz[sparse.point])
+
+
+def _changes(views: Views, first: int, last: int, options: MotionOptions) -> list[np.ndarray | None]:
+    return [changed_between(views, camera, first, last, options) for camera in range(len(views.cameras))]
+
+
+def _footage(workshop: Workshop, plan: Plan, groups: Key, points: Key, pictures: PictureOptions) -> Footage:
+    return Footage(
+        plan.capture,
+        workshop.path(groups),
+        workshop.path(points),
+        plan.fitted,
+        plan.first,
+        plan.stop,
+        pictures.max_width,
+    )
+
+
+def _reads(plan: Plan, pictures: PictureOptions, options: FitOptions) -> dict[str, Any]:
+    """Instants count from the plan's first one; where the plan ends changes no keyframe or segment before the end."""
+    return {
+        "fit": options,
+        "fit_version": fit.VERSION,
+        "pictures": pictures,
+        "cameras": plan.fitted,
+        "first": plan.first,
+        "device": plan.device,
+    }
+
+
+def _without(options: FitOptions, *unread: str) -> FitOptions:
+    """Options with those fields at their defaults that a stage does not read, so that they cannot change its key."""
+    defaults = FitOptions()
+    return replace(options, **{name: getattr(defaults, name) for name in unread})
+
+
+def _counted(progress: Progress) -> Any:
+    return lambda done, total: progress(done, total, "")
+
+
+def figures_of(workshop: Workshop, keys: list[Key]) -> list[Mapping[str, Any]]:
+    """What the fits of these artefacts measured, from their receipts."""
+    return [workshop.store.receipt(key).notes for key in keys]

@@ -1,0 +1,62 @@
+"""The names that Python, the README and the Makefile rely on."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from pipelines.cli import parser
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("pipelines", "tasks", "packuv", "sync", "calibration", "studio")
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_names_resolve_to_this_checkout(package):
+    found = Path(importlib.import_module(package).__file__ or "").resolve()
+    assert found.is_relative_to(ROOT), (
+        f"{package} is imported from {found}; install this checkout with pip install -e ."
+    )
+
+
+@pytest.mark.parametrize("folder", ["tasks", "pipelines"])
+def test_no_module_hides_a_package(folder):
+    names = {path.stem for path in (ROOT / folder).glob("*.py")}
+    assert not names & {*PACKAGES, "bench", "docker", "tests"}
+
+
+def _commands(text: str) -> list[list[str]]:
+    """Lines that call packuv, with continuation lines joined, without the remark after two spaces or a #."""
+    lines = text.replace("\\\n", " ").splitlines()
+    found = [re.search(r"(?:^|/|\s)packuv (.*)", re.split(r" {2,}| #", line.strip())[0]) for line in lines]
+    return [shlex.split(match[1]) for match in found if match]
+
+
+def _is_example(words: list[str]) -> bool:
+    """A command with real values; grammars use brackets and alternatives."""
+    return not any(mark in word for word in words for mark in "[]<>|…")
+
+
+@pytest.mark.parametrize("file", ["Makefile", "README.md", "docs/run.md"])
+def test_documented_commands_exist(file):
+    path = ROOT / file
+    if not path.exists():
+        pytest.skip(f"{file} is not written yet")
+    blocks = re.findall(r"(?m)^(?: {4}|\t).*$", path.read_text())
+    commands = [words for words in _commands("\n".join(blocks)) if words and _is_example(words)]
+    for words in commands:
+        parser().parse_args(words)  # raises UsageError for an unknown command or option
+    assert commands or file == "docs/run.md"
+
+
+def test_make_targets_that_the_readme_names_exist():
+    readme = ROOT / "README.md"
+    if not readme.exists():
+        pytest.skip("README.md is not written yet")
+    targets = set(re.findall(r"(?m)^([a-z][a-z-]*):", (ROOT / "Makefile").read_text()))
+    named = set(re.findall(r"\bmake ([a-z][a-z-]*)", readme.read_text()))
+    assert named <= targets
