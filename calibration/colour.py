@@ -143,8 +143,8 @@ def _channel(data: _Light, log: np.ndarray, cameras: int, options: BalanceOption
     weight = trust
     for _ in range(30):
         before, (matrix, vector) = gains, _normal_equations(row, data.camera, log, weight, cameras)
-        # Without a fixed mean every gain could grow alike; the pseudo-inverse picks mean 0 in each connected group.
-        gains = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True) @ vector
+        # Without a fixed mean all gains could grow alike; the ridge picks mean 0 in each group that shares points.
+        gains = np.linalg.solve(matrix + 1e-8 * max(float(np.trace(matrix)), 1e-30) * np.eye(cameras), vector)
         if np.abs(gains - before).max() < 1e-5:  # a hundredth of what 8 bits resolve
             break
         level = log + gains[data.camera]

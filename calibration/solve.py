@@ -123,13 +123,14 @@ def _keypoints(shots: Sequence[Features], still_px: float = 1.0) -> _Keypoints:
     The static scene shows the same features, and the same wrong matches, at every instant; counted anew each time, a
     few wrong ones would soon outnumber what COLMAP asks of a pair.
     """
-    pixels, rows = shots[0].pixels, [np.arange(len(shots[0].pixels), dtype=np.int32)]
-    for shot in shots[1:]:
-        nearest, distance = _nearest(shot.pixels, pixels)
+    pixels, rows = np.zeros((0, 2)), []
+    for shot in shots:
+        spots = shot.pixels[np.unique(shot.places, return_index=True)[1]]  # [S, 2], one for each place
+        nearest, distance = _nearest(spots, pixels)
         new = distance > still_px
         numbers = np.where(new, len(pixels) + np.cumsum(new) - 1, nearest)
-        rows.append(numbers.astype(np.int32))
-        pixels = np.concatenate([pixels, shot.pixels[new]])
+        rows.append(numbers[shot.places].astype(np.int32))
+        pixels = np.concatenate([pixels, spots[new]])
     return _Keypoints(pixels, tuple(rows))
 
 

@@ -44,8 +44,9 @@ class TriangulateOptions:
     """Cameras that must see a point; two features on one epipolar line always make a point, right or wrong"""
     min_angle_deg: float = 1.5
     """Greatest angle between two rays of a point must reach this, or its depth is a guess"""
-    patch_px: int = 5
-    """Side of the square whose mean is an observation's colour"""
+    patch_px: int = 9
+    """Side of the square whose mean is an observation's colour, by which cameras are balanced. With 5, cameras of a
+    dome disagree by 4.7 % after balancing, with 9 by 4.0 %; larger ones mix in what lies behind"""
     judge: MatchOptions = field(default_factory=MatchOptions)
 
     def __post_init__(self) -> None:
@@ -239,7 +240,9 @@ class _Part:
     xyz: np.ndarray
     errors_px: np.ndarray
     light: np.ndarray
-    clean: np.ndarray
+    """float32 [M, 3], mean of a patch, NaN where it is clipped"""
+    tint: np.ndarray
+    """float32 [M, 3], mean of the middle 3 x 3 pixels"""
 
 
 def _part(
@@ -253,12 +256,14 @@ def _part(
         rig, _sightings(rig, features, pairs, options), max_error_px=options.max_error_px,
         min_views=options.min_views, min_angle_deg=options.min_angle_deg,
     )  # fmt: skip
-    light, clean = np.zeros((len(errors), 3), np.float32), np.zeros(len(errors), bool)
+    light, tint = np.zeros((2, len(errors), 3), np.float32)
     for index, name in enumerate(rig.names):
         mine = sightings.camera == index
         if mine.any():
-            light[mine], clean[mine] = patch_light(pictures[name], sightings.pixels[mine], side_px=options.patch_px)
-    return _Part(sightings, xyz, errors, light, clean)
+            mean, clean = patch_light(pictures[name], sightings.pixels[mine], side_px=options.patch_px)
+            light[mine] = np.where(clean[:, None], mean, np.float32(np.nan))
+            tint[mine] = patch_light(pictures[name], sightings.pixels[mine], side_px=3)[0]
+    return _Part(sightings, xyz, errors, light, tint)
 
 
 def patch_light(picture: np.ndarray, pixels: np.ndarray, *, side_px: int) -> tuple[np.ndarray, np.ndarray]:
@@ -289,13 +294,13 @@ def _joined(
     camera = np.concatenate([part.sightings.camera for part in parts])
     pixels = np.concatenate([part.sightings.pixels for part in parts])
     errors = np.concatenate([part.errors_px for part in parts])
-    light, clean = np.concatenate([part.light for part in parts]), np.concatenate([part.clean for part in parts])
+    tint = np.concatenate([part.tint for part in parts])
     whole = Sightings(point.astype(np.int32), camera, pixels)
     return SparsePoints(
-        rig.names, np.concatenate([part.xyz for part in parts]), _srgb(medians(light, whole.point)), whole.views,
+        rig.names, np.concatenate([part.xyz for part in parts]), _srgb(medians(tint, whole.point)), whole.views,
         np.sqrt(np.add.reduceat(errors**2, whole.starts) / whole.views).astype(np.float32),
         np.repeat(np.arange(len(parts)), counts).astype(np.int32), whole.point, whole.camera,
-        _undistorted_all(rig, whole), np.where(clean[:, None], light, np.float32(np.nan)),
+        _undistorted_all(rig, whole), np.concatenate([part.light for part in parts]),
         matches_report(rig, evidence, errors_px=errors, options=options.judge),
     )  # fmt: skip
 

@@ -7,21 +7,16 @@ while, moves as if it were optimized by itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from packuv.raster.cpu import prefer_tbb
+from packuv.raster.kernel import kernel
 
 _CHUNKS = 64
 _f32 = np.float32
-_OPTIONS: dict[str, Any] = {
-    "cache": True,
-    "error_model": "numpy",
-    "nogil": True,
-    "fastmath": {"contract", "nsz", "arcp"},
-}
+_FAST = frozenset({"contract", "nsz", "arcp"})
 
 
 @dataclass(frozen=True)
@@ -101,7 +96,7 @@ def adam_step(
           _f32(options.epsilon))  # fmt: skip
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True, fastmath=_FAST)
 def _step(parameters, gradient, first, second, steps, rates, rows, beta1, beta2, epsilon):
     count, columns = parameters.shape
     keep1, keep2, add1, add2 = _f32(beta1), _f32(beta2), _f32(1 - beta1), _f32(1 - beta2)

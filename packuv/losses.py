@@ -7,13 +7,14 @@ window of sigma 1.5, zeros beyond the border, constants 0.01^2 and 0.03^2, mean 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from packuv.raster.cpu import prefer_tbb
+from packuv.raster.kernel import kernel
 from packuv.raster.project import TILE
+from packuv.raster.simd import ALL, WIDTH, above, fma, larger, load, select, splat, store, store_sums, zeros
 
 RADIUS = 5
 _WINDOW = 2 * RADIUS + 1
@@ -25,12 +26,6 @@ _weights = np.exp(-((np.arange(_WINDOW) - RADIUS) ** 2) / (2 * 1.5**2))
 _KERNEL = (_weights / _weights.sum()).astype(np.float32)
 _C1, _C2 = _f32(0.01**2), _f32(0.03**2)
 _0, _1, _2 = _f32(0), _f32(1), _f32(2)
-_OPTIONS: dict[str, Any] = {
-    "cache": True,
-    "error_model": "numpy",
-    "nogil": True,
-    "fastmath": {"contract", "nsz", "arcp"},
-}
 
 
 @dataclass(frozen=True)
@@ -77,15 +72,15 @@ def photometric_loss(
             f"tiles must be bool {shape} for pictures {picture.shape}, but is {active.dtype} {active.shape}"
         )
     prefer_tbb()
-    pieces = _pieces(active)
+    pieces = _pieces(active, width, height)
     sums = np.empty((channels * len(pieces), 2))
     gradient = np.empty_like(target) if out is None else out
     pixels = _pixel_count(active, height, width)
     scale = 1.0 / max(channels * pixels, 1)
     if tiles is not None:
         gradient[:] = 0
-    _l1_ssim(picture, target, active.view(np.uint8), pieces, (1 - options.ssim_share) * scale,
-             -options.ssim_share * scale, gradient, sums)  # fmt: skip
+    _l1_ssim(picture.reshape(-1), target.reshape(-1), active.view(np.uint8), pieces,
+             (1 - options.ssim_share) * scale, -options.ssim_share * scale, gradient.reshape(-1), sums)  # fmt: skip
     l1, ssim = sums.sum(0) * scale if pixels else (0.0, 1.0)
     return PhotometricLoss((1 - options.ssim_share) * l1 + options.ssim_share * (1 - ssim), l1, ssim, gradient)
 
@@ -106,151 +101,191 @@ def _pixel_count(active: np.ndarray, height: int, width: int) -> int:
     return int(rows @ active.astype(np.int64) @ columns)
 
 
-def _pieces(active: np.ndarray) -> np.ndarray:
-    """Rectangles of tiles [y0, y1, x0, x1), int64 [n, 4]: per strip, the runs of columns with an active tile."""
+def _pieces(active: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Rectangles of pixels y0, y1, x0, x1, then width and height, int64 [n, 6].
+
+    They are the runs of columns that have an active tile, in each strip of the picture.
+    """
     pieces = []
     for y in range(0, active.shape[0], _STRIP):
         columns = np.concatenate([[False], active[y : y + _STRIP].any(0), [False]])
-        edges = np.flatnonzero(columns[1:] != columns[:-1])
-        pieces += [(y, min(y + _STRIP, active.shape[0]), x0, x1) for x0, x1 in edges.reshape(-1, 2)]
-    return np.array(pieces, np.int64).reshape(-1, 4)
+        for x0, x1 in np.flatnonzero(columns[1:] != columns[:-1]).reshape(-1, 2):
+            rows, run = (y, min(y + _STRIP, active.shape[0])), (x0, x1)
+            pieces.append((*(min(TILE * v, height) for v in rows), *(min(TILE * v, width) for v in run), width, height))
+    return np.array(pieces, np.int64).reshape(-1, 6)
 
 
-@njit(**_OPTIONS)
-def _blur_row(source, out, count):
-    """out[x] = sum of window[k] * source[x + k]; source has 10 values more."""
-    w0, w1, w2, w3, w4, w5 = _KERNEL[0], _KERNEL[1], _KERNEL[2], _KERNEL[3], _KERNEL[4], _KERNEL[5]
-    for x in range(count):
-        out[x] = (
-            w5 * source[x + 5] + w4 * (source[x + 4] + source[x + 6]) + w3 * (source[x + 3] + source[x + 7])
-            + w2 * (source[x + 2] + source[x + 8]) + w1 * (source[x + 1] + source[x + 9])
-            + w0 * (source[x] + source[x + 10])
-        )  # fmt: skip
+# Kernels work on one flat piece of memory, since every array costs Numba compile time. `stride` is the length of a row.
 
 
-@njit(**_OPTIONS)
-def _blur_column(ring, y, out, count):
-    """out = sum over rows y - 5 .. y + 5 of a ring of 11 rows."""
-    a0, b0 = ring[(y - 5) % 11], ring[(y + 5) % 11]
-    a1, b1 = ring[(y - 4) % 11], ring[(y + 4) % 11]
-    a2, b2 = ring[(y - 3) % 11], ring[(y + 3) % 11]
-    a3, b3 = ring[(y - 2) % 11], ring[(y + 2) % 11]
-    a4, b4, c = ring[(y - 1) % 11], ring[(y + 1) % 11], ring[y % 11]
-    w0, w1, w2, w3, w4, w5 = _KERNEL[0], _KERNEL[1], _KERNEL[2], _KERNEL[3], _KERNEL[4], _KERNEL[5]
-    for x in range(count):
-        out[x] = (
-            w5 * c[x] + w4 * (a4[x] + b4[x]) + w3 * (a3[x] + b3[x]) + w2 * (a2[x] + b2[x])
-            + w1 * (a1[x] + b1[x]) + w0 * (a0[x] + b0[x])
-        )  # fmt: skip
+@kernel(inner=True)
+def _blur_row(memory, source, out, stride):
+    """memory[out + x] = sum of window[k] * memory[source + x + k]; the source has ten values more."""
+    w0, w1, w2 = splat(_KERNEL[0]), splat(_KERNEL[1]), splat(_KERNEL[2])
+    w3, w4, w5 = splat(_KERNEL[3]), splat(_KERNEL[4]), splat(_KERNEL[5])
+    for x in range(source, source + stride, WIDTH):
+        total = w5 * load(memory, x + 5)
+        total = fma(w4, load(memory, x + 4) + load(memory, x + 6), total)
+        total = fma(w3, load(memory, x + 3) + load(memory, x + 7), total)
+        total = fma(w2, load(memory, x + 2) + load(memory, x + 8), total)
+        total = fma(w1, load(memory, x + 1) + load(memory, x + 9), total)
+        store(memory, out + x - source, fma(w0, load(memory, x) + load(memory, x + 10), total))
 
 
-@njit(**_OPTIONS)
-def _read_row(picture, target, active, y, x0, a, b, mask):
-    """Row y from column x0 on: the target, the picture where active, and a 0/1 mask; zeros beyond the border."""
-    for i in range(a.shape[0]):
-        x = x0 + i
-        a[i] = b[i] = mask[i] = _0
-        if 0 <= x < target.shape[1] and 0 <= y < target.shape[0]:
-            b[i] = target[y, x]
-            mask[i] = _1 if active[y >> 4, x >> 4] != 0 else _0
-            a[i] = picture[y, x] if mask[i] > _0 else b[i]
+@kernel(inner=True)
+def _blur_column(memory, ring, y, out, stride):
+    """Sum of window[k] times row y - 5 + k of a ring of 11 rows."""
+    w0, w1, w2 = splat(_KERNEL[0]), splat(_KERNEL[1]), splat(_KERNEL[2])
+    w3, w4, w5 = splat(_KERNEL[3]), splat(_KERNEL[4]), splat(_KERNEL[5])
+    a0, b0 = ring + (y - 5) % _WINDOW * stride, ring + (y + 5) % _WINDOW * stride
+    a1, b1 = ring + (y - 4) % _WINDOW * stride, ring + (y + 4) % _WINDOW * stride
+    a2, b2 = ring + (y - 3) % _WINDOW * stride, ring + (y + 3) % _WINDOW * stride
+    a3, b3 = ring + (y - 2) % _WINDOW * stride, ring + (y + 2) % _WINDOW * stride
+    a4, b4 = ring + (y - 1) % _WINDOW * stride, ring + (y + 1) % _WINDOW * stride
+    c = ring + y % _WINDOW * stride
+    for x in range(0, stride, WIDTH):
+        total = w5 * load(memory, c + x)
+        total = fma(w4, load(memory, a4 + x) + load(memory, b4 + x), total)
+        total = fma(w3, load(memory, a3 + x) + load(memory, b3 + x), total)
+        total = fma(w2, load(memory, a2 + x) + load(memory, b2 + x), total)
+        total = fma(w1, load(memory, a1 + x) + load(memory, b1 + x), total)
+        store(memory, out + x, fma(w0, load(memory, a0 + x) + load(memory, b0 + x), total))
 
 
-@njit(**_OPTIONS)
-def _blur_products(a, b, product, rings, slot, count):
-    """Blur a row of a, b, a a, b b and a b into their rings."""
-    _blur_row(a, rings[0, slot], count)
-    _blur_row(b, rings[1, slot], count)
-    for x in range(a.shape[0]):
-        product[x] = a[x] * a[x]
-    _blur_row(product, rings[2, slot], count)
-    for x in range(a.shape[0]):
-        product[x] = b[x] * b[x]
-    _blur_row(product, rings[3, slot], count)
-    for x in range(a.shape[0]):
-        product[x] = a[x] * b[x]
-    _blur_row(product, rings[4, slot], count)
+@kernel(inner=True)
+def _read_row(picture, target, active, base, x0, x1, memory, row, step):
+    """Columns x0 to x1, inside the picture, of the row at flat element `base`, into five rows of `memory`.
+
+    They are a, the picture where active, else the target; b, the target; a a + b b; a b; the mask, 0 or 1.
+    """
+    for tile in range(x0 // TILE, -(-x1 // TILE)):
+        on = active[tile] != 0
+        x = TILE * tile
+        if x >= x0 and x + TILE <= x1:
+            b = load(target, base + x)
+            a = load(picture, base + x) if on else b
+            at = row + x - x0
+            store(memory, at, a)
+            store(memory, at + step, b)
+            store(memory, at + 2 * step, fma(a, a, b * b))
+            store(memory, at + 3 * step, a * b)
+            store(memory, at + 4 * step, splat(_1 if on else _0))
+            continue
+        for i in range(max(x, x0), min(x + TILE, x1)):
+            v = target[base + i]
+            u = picture[base + i] if on else v
+            at = row + i - x0
+            memory[at], memory[at + step], memory[at + 2 * step], memory[at + 3 * step] = u, v, u * u + v * v, u * v
+            memory[at + 4 * step] = _1 if on else _0
 
 
-@njit(**_OPTIONS)
-def _ssim_row(blurred, mask, derivatives, ssim):
-    """SSIM of one row under the mask, and its derivatives by the blurs of a, a a and a b."""
-    ma, mb, maa, mbb, mab = blurred[0], blurred[1], blurred[2], blurred[3], blurred[4]
-    d_mean, d_square, d_product = derivatives[0], derivatives[1], derivatives[2]
-    for x in range(mask.shape[0]):
-        a, b = ma[x], mb[x]
-        variances = max(maa[x] - a * a, _0) + max(mbb[x] - b * b, _0)  # rounding may leave them below zero
-        a1, a2 = _2 * a * b + _C1, _2 * (mab[x] - a * b) + _C2
-        b1, b2 = a * a + b * b + _C1, variances + _C2
-        inverse = mask[x] / (b1 * b2)
-        value = a1 * a2 * inverse
-        to_product, to_square = _2 * a1 * inverse, -value / b2
-        to_mean = _2 * b * a2 * inverse - _2 * a * value / b1
-        d_mean[x] = to_mean - _2 * a * to_square - b * to_product
-        d_square[x] = to_square
-        d_product[x] = to_product
-        ssim[x] = value
+@kernel(inner=True)
+def _ssim_row(memory, blurred, mask, owned, derivatives, step, stride, sums):
+    """SSIM of one row under the mask, and its derivatives by the blurs of a, of a a + b b and of a b.
+
+    `blurred` begins four rows of `stride`: a, b, a a + b b, a b; `derivatives` three rows of `step`. Returns the sum
+    where the row `owned` is 1. `sums` is scratch.
+    """
+    one, two, c1, c2, zero, total = splat(_1), splat(_2), splat(_C1), splat(_C2), zeros(ALL), zeros(ALL)
+    for x in range(0, stride, WIDTH):
+        a, b = load(memory, blurred + x), load(memory, blurred + stride + x)
+        squares, product = load(memory, blurred + 2 * stride + x), load(memory, blurred + 3 * stride + x)
+        both = a * b
+        power = fma(a, a, b * b)
+        a1, a2 = fma(two, both, c1), fma(two, product - both, c2)
+        b1, b2 = power + c1, larger(squares - power, zero) + c2  # rounding may leave a variance below zero
+        inverse = one / (b1 * b2)
+        factor = inverse * load(memory, mask + x)
+        ssim = a1 * a2 * factor
+        total = fma(ssim, load(memory, owned + x), total)
+        to_square, to_product = zero - ssim * b1 * inverse, two * a1 * factor
+        to_mean = two * (b * a2 * factor - a * ssim * b2 * inverse)
+        store(memory, derivatives + x, to_mean - two * a * to_square - b * to_product)
+        store(memory, derivatives + step + x, to_square)
+        store(memory, derivatives + 2 * step + x, to_product)
+    store_sums(sums, 0, (total,))
+    return sums[0]
 
 
-@njit(**_OPTIONS)
-def _gradient_row(picture, target, mask, blurred, l1_scale, ssim_scale, out):
-    """Gradient of one row where the mask is set; returns the row's absolute difference."""
-    d_mean, d_square, d_product = blurred[0], blurred[1], blurred[2]
-    total = _0
-    for x in range(out.shape[0]):
-        a, b = picture[x], target[x]
-        difference = (a - b) * mask[x]
-        total += abs(difference)
-        sign = _1 if difference > _0 else (-_1 if difference < _0 else _0)
-        ssim = d_mean[x] + _2 * a * d_square[x] + b * d_product[x]
-        out[x] = l1_scale * sign + ssim_scale * ssim * mask[x]
-    return total
+@kernel(inner=True)
+def _gradient_row(memory, row, step, blurred, owned, stride, l1_scale, ssim_scale, sums):
+    """Gradient of one row, in place of the first of its three `blurred` rows.
+
+    Returns the absolute difference where the row `owned` is 1. `row` is the first of the rows read.
+    """
+    zero, two, plus, minus = zeros(ALL), splat(_2), splat(l1_scale), splat(-l1_scale)
+    scale, total = splat(ssim_scale), zeros(ALL)
+    for x in range(0, stride, WIDTH):
+        a, b, on = load(memory, row + x), load(memory, row + step + x), load(memory, row + 4 * step + x)
+        difference = (a - b) * on
+        total = fma(larger(difference, zero - difference), load(memory, owned + x), total)
+        sign = select(above(difference, zero), plus, select(above(zero, difference), minus, zero))
+        d_square, d_product = load(memory, blurred + stride + x), load(memory, blurred + 2 * stride + x)
+        ssim = fma(two * a, d_square, fma(b, d_product, load(memory, blurred + x)))
+        store(memory, blurred + x, fma(scale * on, ssim, sign))
+    store_sums(sums, 0, (total,))
+    return sums[0]
 
 
-@njit(**_OPTIONS)
-def _piece(picture, target, active, y0, y1, x0, x1, l1_scale, ssim_scale, gradient):
+@kernel(inner=True)
+def _piece(picture, target, active, width, height, y0, y1, x0, x1, l1_scale, ssim_scale, gradient):
     """One channel of one rectangle of pixels, row by row: products, SSIM five rows behind, gradient ten behind.
 
-    Returns the sums of absolute differences and of SSIM. Rings hold the last 11 rows of each blur along x.
+    Returns the sums of absolute differences and of SSIM. Rings hold the last 11 rows: those read, with ten columns
+    more than the rectangle on either side, their blurs along x, with five, and the blurs of the derivatives.
     """
-    wide, owned = x1 - x0 + 2 * RADIUS, x1 - x0
-    a, b = np.empty(wide + 2 * RADIUS, np.float32), np.empty(wide + 2 * RADIUS, np.float32)
-    mask, product = np.empty(wide + 2 * RADIUS, np.float32), np.empty(wide + 2 * RADIUS, np.float32)
-    rings, d_rings = np.zeros((5, _WINDOW, wide), np.float32), np.zeros((3, _WINDOW, owned), np.float32)
-    masks, ssim = np.zeros((_WINDOW, wide), np.float32), np.empty(wide, np.float32)
-    blurred, derivatives = np.empty((5, wide), np.float32), np.empty((3, wide), np.float32)
+    count = x1 - x0
+    stride = (count + 2 * RADIUS + WIDTH - 1) // WIDTH * WIDTH
+    step, ring = stride + 2 * WIDTH, _WINDOW * stride
+    derivatives = 5 * _WINDOW * step
+    owned = derivatives + 3 * step
+    rings = owned + step
+    blurred = rings + 7 * ring
+    memory, sums = np.zeros(blurred + 4 * stride, np.float32), np.empty(WIDTH, np.float32)
+    memory[owned + RADIUS : owned + RADIUS + count] = _1
     absolute = similarity = 0.0
     for row in range(y0 - 2 * RADIUS, y1 + 2 * RADIUS):
-        _read_row(picture, target, active, row, x0 - 2 * RADIUS, a, b, mask)
-        masks[row % _WINDOW, :] = mask[RADIUS : RADIUS + wide]
-        _blur_products(a, b, product, rings, row % _WINDOW, wide)
+        read = row % _WINDOW * 5 * step
+        if 0 <= row < height:
+            begin, end = max(x0 - 2 * RADIUS, 0), min(x1 + 2 * RADIUS, width)
+            _read_row(picture, target, active[row // TILE], row * width, begin, end, memory,
+                      read + begin - x0 + 2 * RADIUS, step)  # fmt: skip
+        else:
+            memory[read : read + 5 * step] = _0
+        for k in range(4):
+            _blur_row(memory, read + k * step, rings + k * ring + row % _WINDOW * stride, stride)
         y = row - RADIUS
         if y < y0 - RADIUS:
             continue
-        for k in range(5):
-            _blur_column(rings[k], y, blurred[k], wide)
-        _ssim_row(blurred, masks[y % _WINDOW], derivatives, ssim)
-        if y0 <= y < y1:
-            similarity += ssim[RADIUS : RADIUS + owned].sum()
+        for k in range(4):
+            _blur_column(memory, rings + k * ring, y, blurred + k * stride, stride)
+        mask = (y % _WINDOW * 5 + 4) * step + RADIUS
+        total = _ssim_row(memory, blurred, mask, owned, derivatives, step, stride, sums)
+        similarity += total if y0 <= y < y1 else _0
         for k in range(3):
-            _blur_row(derivatives[k], d_rings[k, y % _WINDOW], owned)
+            _blur_row(memory, derivatives + k * step, rings + (4 + k) * ring + y % _WINDOW * stride, stride)
         y = row - 2 * RADIUS
         if y >= y0:
             for k in range(3):
-                _blur_column(d_rings[k], y, blurred[k], owned)
-            absolute += _gradient_row(picture[y, x0:x1], target[y, x0:x1], masks[y % _WINDOW, RADIUS : RADIUS + owned],
-                                      blurred, l1_scale, ssim_scale, gradient[y, x0:x1])  # fmt: skip
+                _blur_column(memory, rings + (4 + k) * ring, y, blurred + k * stride, stride)
+            read = y % _WINDOW * 5 * step + 2 * RADIUS
+            absolute += _gradient_row(memory, read, step, blurred, owned + RADIUS, stride, l1_scale, ssim_scale, sums)
+            for x in range(count):
+                gradient[y * width + x0 + x] = memory[blurred + x]
     return absolute, similarity
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def _l1_ssim(picture, target, active, pieces, l1_scale, ssim_scale, gradient, sums):
-    """All pieces of all channels; `sums` [channels * pieces, 2] receives absolute differences and SSIM."""
-    channels, height, width = target.shape
-    for job in prange(channels * len(pieces)):
-        channel, piece = job % channels, pieces[job // channels]
+    """All pieces of all channels of flat pictures; `sums` [channels * pieces, 2]: absolute differences and SSIM.
+
+    `pieces` [n, 6] are rectangles of pixels y0, y1, x0, x1, then the width and height of the picture.
+    """
+    for job in prange(sums.shape[0]):
+        y0, y1, x0, x1, width, height = pieces[job % len(pieces)]
+        begin = job // len(pieces) * width * height
+        end = begin + width * height
         sums[job, 0], sums[job, 1] = _piece(
-            picture[channel], target[channel], active,
-            TILE * piece[0], min(TILE * piece[1], height), TILE * piece[2], min(TILE * piece[3], width),
-            _f32(l1_scale), _f32(ssim_scale), gradient[channel],
+            picture[begin:end], target[begin:end], active, width, height, y0, y1, x0, x1, _f32(l1_scale),
+            _f32(ssim_scale), gradient[begin:end],
         )  # fmt: skip

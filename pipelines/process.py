@@ -110,7 +110,7 @@ def plan_of(request: RunRequest, capture: Capture) -> Plan:
         raise ValueError("this version fits on the CPU only; use --device auto or cpu")
     first, stop = request.frames
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
-    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, "cpu", request.seed)
+    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, "cpu")
 
 
 def jobs_at_once(request: RunRequest) -> int:

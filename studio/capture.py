@@ -6,7 +6,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import StrEnum
@@ -21,7 +21,7 @@ from studio.clocks import EPOCH_NS, SECOND_NS, CameraTimes, ClockOptions, record
 from studio.raycast import cast, follow, look_once, render
 from studio.rig import RigOptions, StudioCamera, place_cameras
 from studio.scene import Scene, build_scene
-from studio.truth import PixelTruthWriter, truth_json
+from studio.truth import PixelTruthWriter, Recording, truth_json
 from studio.video import VideoWriter
 
 LATEST_ENTRANCE_S = 6.0
@@ -86,8 +86,8 @@ class SimulateOptions:
     """The door opens after this share of the capture, but after six seconds at the latest"""
     truth: TruthKind = TruthKind.FULL
     calibration: CalibrationKind = CalibrationKind.GIVEN
-    held_out: int = 1
-    """Cameras that capture.toml names as held out, to score the result on"""
+    held_out: int | None = None
+    """Cameras that capture.toml names as held out, to score the result on; None: one of four or more"""
     name: str = "studio"
     """Name of the sequence"""
 
@@ -104,13 +104,18 @@ class SimulateOptions:
             raise ValueError(f"samples must be 1 to 8 rays along each axis of a pixel, but is {self.samples}")
         if not 0 <= self.entrance_share <= 1:
             raise ValueError(f"entrance_share must be 0 to 1, but is {self.entrance_share}")
-        if not 0 <= self.held_out <= self.cameras - 2:
+        if not 0 <= self.held_out_count <= self.cameras - 2:
             raise ValueError(
-                f"held_out must leave two cameras to fit: 0 to {self.cameras - 2} of {self.cameras}, but is {self.held_out}"
+                f"held_out must leave two cameras to fit: 0 to {self.cameras - 2} of {self.cameras}, "
+                f"but is {self.held_out}"
             )
         if not re.fullmatch(r"[\w.-]+", self.name):
             raise ValueError(f"the name must consist of letters, digits, '.', '_' and '-', but is {self.name!r}")
         self._check_size()
+
+    @property
+    def held_out_count(self) -> int:
+        return int(self.cameras >= 4) if self.held_out is None else self.held_out
 
     @property
     def width(self) -> int:
@@ -125,8 +130,8 @@ class SimulateOptions:
             raise ValueError(f"size must be WIDTHxHEIGHT in pixels, as 640x360, but is {self.size!r}")
         if not all(32 <= side <= LARGEST_SIDE and side % 2 == 0 for side in (self.width, self.height)):
             raise ValueError(
-                f"both sides of a picture must be even and from 32 to {LARGEST_SIDE} pixels, since the video halves its "
-                f"chroma, but the size is {self.size}"
+                f"a picture's sides must be even, since video halves its chroma, and 32 to {LARGEST_SIDE} pixels long, "
+                f"but the size is {self.size}"
             )
 
 
@@ -181,31 +186,30 @@ def _write(folder: Path, times: tuple[CameraTimes, ...], options: SimulateOption
     for name, camera_times in zip(names, times, strict=True):
         (folder / "timecodes" / f"{name}.txt").write_text("\n".join(timecode_lines(camera_times)) + "\n")
     entrance_ns = EPOCH_NS + round(entrance_s * SECOND_NS)
-    cameras = {camera.name: parts for camera, *parts in zip(rig, rig, times, gains, strict=True)}
-    truth = truth_json(_plain(options), options.fps, tick_times(options.frames, options.fps), entrance_ns, cameras)
+    recordings = [Recording(*parts) for parts in zip(rig, times, gains, strict=True)]
+    truth = truth_json(_plain(options), options.fps, tick_times(options.frames, options.fps), entrance_ns, recordings)
     (folder / "truth" / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
-    _film_all(folder, build_scene(options.seed, entrance_s), cameras, options, progress)
+    _film_all(folder, build_scene(options.seed, entrance_s), recordings, options, progress)
 
 
 def _film_all(
     folder: Path,
     scene: Scene,
-    cameras: Mapping[str, tuple[StudioCamera, CameraTimes, np.ndarray]],
+    recordings: Sequence[Recording],
     options: SimulateOptions,
     progress: Progress | None,
 ) -> None:
-    done, total = 0, sum(len(times.ticks) for _, times, _ in cameras.values())
-    for camera, times, gains in cameras.values():
-        for _ in _film(folder, scene, camera, times, gains, options):
+    done, total = 0, sum(len(recording.times.ticks) for recording in recordings)
+    for recording in recordings:
+        for _ in _film(folder, scene, recording, options):
             done += 1
             if progress is not None:
                 progress(done, total)
 
 
-def _film(
-    folder: Path, scene: Scene, camera: StudioCamera, times: CameraTimes, gains: np.ndarray, options: SimulateOptions
-):
+def _film(folder: Path, scene: Scene, recording: Recording, options: SimulateOptions) -> Iterator[None]:
     """Film one camera's frames, yielding after each."""
+    camera, times, gains = recording
     view = camera.view
     backdrop = look_once(view, scene.standing, scene.light, scene.colours, samples=options.samples)
     with ExitStack() as stack:
@@ -214,12 +218,12 @@ def _film(
         )
         truth = None
         if options.truth is TruthKind.FULL:
-            truth = stack.enter_context(PixelTruthWriter(folder / "truth" / f"{camera.name}.npz", backdrop.centre_depth))
+            truth = stack.enter_context(
+                PixelTruthWriter(folder / "truth" / f"{camera.name}.npz", backdrop.centre_depth)
+            )
         moment = scene.at(_seconds(times.times_ns[0]))
         for next_ns in times.next_times_ns:
-            light = render(
-                view, backdrop, scene.standing, moment.movers, moment.blockers, scene.light, scene.colours
-            )
+            light = render(view, backdrop, scene.standing, moment.movers, moment.blockers, scene.light, scene.colours)
             video.write(srgb_picture(light, gains))
             later = scene.at(_seconds(next_ns))
             if truth is not None:
@@ -256,7 +260,8 @@ def _to_srgb(light, gains, picture):
 def _write_settings(path: Path, names: list[str], options: SimulateOptions) -> None:
     fps = options.fps
     # evenly spread over the rig, and never the first camera
-    held_out = [names[(2 * place + 1) * options.cameras // (2 * options.held_out)] for place in range(options.held_out)]
+    count = options.held_out_count
+    held_out = [names[(2 * place + 1) * options.cameras // (2 * count)] for place in range(count)]
     lines = [
         "# Written by packuv simulate",
         f'name = "{options.name}"',

@@ -39,12 +39,14 @@ class ClockOptions:
         if not 0 <= self.drop_share <= 0.5:
             raise ValueError(f"the share of dropped frames must be 0 to 0.5, but is {self.drop_share}")
         if self.max_late_frames < 0:
-            raise ValueError(f"cameras cannot start early: max_late_frames must be 0 or more, but is {self.max_late_frames}")
+            raise ValueError(
+                f"cameras cannot start early: max_late_frames must be 0 or more, but is {self.max_late_frames}"
+            )
         for name in ("jitter_us", "offset_us", "drift_ppm"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"{name} must be 0 or more, but is {getattr(self, name)}")
         if self.drift_ppm > 10_000:
-            raise ValueError(f"a clock that drifts by more than 1 % is broken: drift_ppm must be at most 10000, but is {self.drift_ppm}")
+            raise ValueError(f"drift_ppm must be at most 10000, or one per cent, but is {self.drift_ppm}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,10 @@ def record(cameras: int, frames: int, fps: Fraction, seed: int, options: ClockOp
 
 def timecode_lines(times: CameraTimes) -> list[str]:
     """Lines of a timecode file, `frame_<epoch microseconds>_<12-digit counter>`."""
-    return [f"frame_{stamp // 1000}_{times.first_index + place:012d}" for place, stamp in enumerate(times.stamps_ns.tolist())]
+    return [
+        f"frame_{stamp // 1000}_{times.first_index + place:012d}"
+        for place, stamp in enumerate(times.stamps_ns.tolist())
+    ]
 
 
 def _record_one(late: int, frames: int, fps: Fraction, rng: np.random.Generator, options: ClockOptions) -> CameraTimes:

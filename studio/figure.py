@@ -97,9 +97,9 @@ class _Body:
     def add_leg(self, side: int) -> np.ndarray:
         """Thigh, shin and shoe; returns the shoe's middle in the world."""
         cloth = Look("denim", (1.0, 1.4), tint=self.clothes.trousers)
-        knee, heel, toe = self._foot(side) + [0, 0, self.hips]
+        knee, heel, toe = self._foot(side) + np.array([0, 0, self.hips])
         hip = np.array([0.0, side * 0.088, self.hips])
-        ankle = heel + [0.045, 0, 0.055]
+        ankle = heel + np.array([0.045, 0, 0.055])
         self._limb(hip, knee, (0.088, 0.058), cloth)
         self._limb(knee, ankle, (0.057, 0.042), cloth)
         self._limb(heel, toe, (0.044, 0.036), Look("white", (2.0, 1.0), tint=self.clothes.shoes))

@@ -73,6 +73,10 @@ def _slab(parts: Parts, owner: int, low: Point, high: Point, look: Look) -> None
     parts.box(owner, (a + b) / 2, (b - a) / 2, look)
 
 
+def _above(point: np.ndarray, height: float) -> np.ndarray:
+    return point + np.array([0.0, 0.0, height])
+
+
 def _board(parts: Parts, owner: int, texture: str, centre: Point, wide: float, high: float, wall: str) -> None:
     """A picture on a wall, 3 cm thick; the wall is named by its outward axis."""
     half = (0.015, wide / 2, high / 2) if wall in ("+x", "-x") else (wide / 2, 0.015, high / 2)
@@ -187,7 +191,11 @@ def _add_books(
     while True:
         # a block of books with one height: each shows its own spine of the texture
         books = int(rng.integers(1, 5))
-        wide, high, first = books * float(rng.uniform(0.025, 0.05)), float(rng.uniform(0.2, 0.34)), int(rng.integers(16))
+        wide, high, first = (
+            books * float(rng.uniform(0.025, 0.05)),
+            float(rng.uniform(0.2, 0.34)),
+            int(rng.integers(16)),
+        )
         if y + wide > end:
             return
         deep = front - float(rng.uniform(0.02, 0.08))
@@ -228,7 +236,7 @@ def _add_sideboard(parts: Parts, furniture: int, things: int, rng: np.random.Gen
     _slab(parts, things, (-1.08, -HALF_Y + 0.08, 1.12), (-0.82, -HALF_Y + 0.32, 1.30), Look("tiles", (2.0, 2.8)))
     for x, high in ((0.2, 0.22), (0.36, 0.30), (0.52, 0.17)):
         foot = np.array([x, -HALF_Y + 0.22, 0.85])
-        parts.cone(things, foot, foot + [0, 0, high], (0.03, 0.022), Look("white", tint=(0.95, 0.86, 0.62)))
+        parts.cone(things, foot, _above(foot, high), (0.03, 0.022), Look("white", tint=(0.95, 0.86, 0.62)))
 
 
 def _add_crates(parts: Parts, things: int) -> None:
@@ -246,12 +254,12 @@ def _add_crates(parts: Parts, things: int) -> None:
 
 def _add_plant(parts: Parts, things: int, place: tuple[float, float], size: float, rng: np.random.Generator) -> None:
     foot = np.array([*place, 0.0])
-    parts.cylinder(things, foot + [0, 0, 0.18 * size], 0.19 * size, 0.36 * size, Look("porcelain", (3.0, 1.0)))
+    parts.cylinder(things, _above(foot, 0.18 * size), 0.19 * size, 0.36 * size, Look("porcelain", (3.0, 1.0)))
     for _ in range(16):
         angle, rise = rng.uniform(0, 2 * np.pi), rng.uniform(0.25, 0.95)
         lean = rng.uniform(0.15, 0.38) * size
-        tip = foot + [lean * np.cos(angle), lean * np.sin(angle), (0.45 + rise) * size]
-        parts.cone(things, foot + [0, 0, 0.3 * size], tip, (0.012 * size, 0.008 * size), Look("leaves", (1, 4)))
+        tip = foot + np.array([lean * np.cos(angle), lean * np.sin(angle), (0.45 + rise) * size])
+        parts.cone(things, _above(foot, 0.3 * size), tip, (0.012 * size, 0.008 * size), Look("leaves", (1, 4)))
         radii = np.array([0.16, 0.06, 0.022]) * size
         parts.ellipsoid(
             things, tip, radii, Look("leaves", (1.5, 1.0)), turn_about_z(angle) @ _pitch(rng.uniform(-0.7, 0.4))
@@ -266,13 +274,13 @@ def _pitch(angle_rad: float) -> np.ndarray:
 
 def _add_stool(parts: Parts, furniture: int, place: tuple[float, float]) -> None:
     middle = np.array([*place, 0.0])
-    parts.cylinder(furniture, middle + [0, 0, 0.45], 0.19, 0.05, Look("sofa", (2.0, 0.3)))
+    parts.cylinder(furniture, _above(middle, 0.45), 0.19, 0.05, Look("sofa", (2.0, 0.3)))
     for angle in (0.6, 2.7, 4.8):
         out = np.array([np.cos(angle), np.sin(angle), 0.0])
         parts.cone(
             furniture,
-            middle + 0.19 * out + [0, 0, 0.02],
-            middle + 0.12 * out + [0, 0, 0.43],
+            _above(middle + 0.19 * out, 0.02),
+            _above(middle + 0.12 * out, 0.43),
             (0.018, 0.022),
             Look("wood_light"),
         )
@@ -280,8 +288,8 @@ def _add_stool(parts: Parts, furniture: int, place: tuple[float, float]) -> None
 
 def _add_floor_lamp(parts: Parts, furniture: int, place: tuple[float, float]) -> None:
     foot = np.array([*place, 0.0])
-    parts.cylinder(furniture, foot + [0, 0, 0.02], 0.17, 0.04, Look("metal"))
-    parts.cone(furniture, foot + [0, 0, 0.04], foot + [0, 0, 1.5], (0.016, 0.014), Look("metal", (1, 4)))
+    parts.cylinder(furniture, _above(foot, 0.02), 0.17, 0.04, Look("metal"))
+    parts.cone(furniture, _above(foot, 0.04), _above(foot, 1.5), (0.016, 0.014), Look("metal", (1, 4)))
     parts.cone(
-        furniture, foot + [0, 0, 1.52], foot + [0, 0, 1.78], (0.19, 0.12), Look("plaid", (3.0, 1.0), emission=0.35)
+        furniture, _above(foot, 1.52), _above(foot, 1.78), (0.19, 0.12), Look("plaid", (3.0, 1.0), emission=0.35)
     )

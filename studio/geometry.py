@@ -175,11 +175,12 @@ def _affine(turn: np.ndarray | None, centre: np.ndarray, scale: np.ndarray) -> n
 
 
 def _frame(axis: np.ndarray) -> np.ndarray:
-    """A rotation whose z axis is the given unit vector, float64 [3, 3]; x stays as level as it can."""
-    side = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    y = np.cross(axis, side)
-    y /= np.linalg.norm(y)
-    return np.stack([np.cross(y, axis), y, axis], axis=1)
+    """A rotation whose z axis is the given unit vector, float64 [3, 3]; its y axis is level."""
+    x, y, z = (float(part) for part in axis)
+    across = np.hypot(x, y)
+    # straight up or down, every direction is level
+    side = (-y / across, x / across) if across > 1e-9 else (0.0, 1.0)
+    return np.array([[side[1] * z, side[0], x], [-side[0] * z, side[1], y], [side[0] * y - side[1] * x, 0.0, z]])
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ A ray is centre + t * direction with a direction that has length 1 along the cam
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -28,6 +28,9 @@ MOVED_M = 1e-6
 NEAREST = 1e-9
 """Hits closer than this part of a ray's length are the surface that the ray starts from"""
 BLACK = 0.0
+APERTURE_PX, PAINT_BLUR_PX = 1.6, 1.2
+"""A pixel's rays spread over this width, and paint is averaged over that. A real lens and sensor are no sharper; with
+rays inside the pixel alone, halving the chroma left 30 to 32 dB of a 320x180 picture, with this 34 to 35"""
 
 _LIGHT = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
 _PI = float(np.pi)
@@ -80,7 +83,7 @@ class Shapes(NamedTuple):
     """float64 [N, 3]"""
     first: np.ndarray
     """int32 [N]: the left child (the right one follows it), or a leaf's first place in `order`"""
-    count: np.ndarray
+    fill: np.ndarray
     """int32 [N]: items of a leaf, 0 for an inner node"""
     order: np.ndarray
     """int32 [P + F]: items, leaf by leaf"""
@@ -164,7 +167,9 @@ def look_once(view: View, standing: Shapes, light: Light, colours: Paints, *, sa
     shape = (view.height, view.width, samples * samples)
     backdrop = Backdrop(
         np.empty(shape, np.float32),
-        *(np.empty((*shape, 3), np.float32) for _ in range(3)),
+        np.empty((*shape, 3), np.float32),
+        np.empty((*shape, 3), np.float32),
+        np.empty((*shape, 3), np.float32),
         np.empty(shape[:2]),
         np.empty(shape[:2], np.uint8),
     )
@@ -215,7 +220,9 @@ def follow(view: View, hits: Hits, standing: Shapes, now: Shapes, later: Shapes)
 
 # Only compiled code calls these. They allocate nothing, so they need no reference counts of arrays: left on, these take
 # half of the run time, for each call counts every array of the tuples that it is given.
-_INNER = {"cache": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
+_INNER: dict[str, Any] = {
+    "cache": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False
+}  # fmt: skip
 _kernel = numba.njit(**_INNER)
 _inline = numba.njit(**_INNER, forceinline=True)
 
@@ -371,7 +378,7 @@ def _first_hit(shapes, ox, oy, oz, dx, dy, dz, limit, stack, entries, any_hit):
         node = stack[top]
         if entries[top] >= best:
             continue
-        first, count = shapes.first[node], shapes.count[node]
+        first, count = shapes.first[node], shapes.fill[node]
         if count == 0:
             near = _enter(shapes, first, ox, oy, oz, ix, iy, iz, best)
             far = _enter(shapes, first + 1, ox, oy, oz, ix, iy, iz, best)
@@ -410,6 +417,14 @@ def _ray(view, x, y):
         r[0, 1] * a + r[1, 1] * b + r[2, 1],
         r[0, 2] * a + r[1, 2] * b + r[2, 2],
     )
+
+
+@_inline
+def _sample_ray(view, column, row, k, samples):
+    """The k-th ray of a pixel, on an even grid about its centre."""
+    x = 0.5 + APERTURE_PX * ((k % samples + 0.5) / samples - 0.5)
+    y = 0.5 + APERTURE_PX * ((k // samples + 0.5) / samples - 0.5)
+    return _ray(view, column + x, row + y)
 
 
 # What the surface looks like
@@ -625,13 +640,13 @@ def _surface(shapes, item, second, third, px, py, pz, dx, dy, dz):
 
 
 @_inline
-def _appearance(view, shapes, light, colours, hit, px, py, pz, dx, dy, dz, pitch, lamp):
-    """Normal, ambient and key radiance at a hit (t, item, weights); `pitch` is the distance of samples, pixels."""
+def _appearance(view, shapes, light, colours, hit, px, py, pz, dx, dy, dz, lamp):
+    """Normal, ambient and key radiance at a hit (t, item, weights)."""
     t, item, second, third = hit
     dx, dy, dz = _unit(dx, dy, dz)
     nx, ny, nz, u, v, facing = _surface(shapes, item, second, third, px, py, pz, dx, dy, dz)
     looks, row = shapes.looks, shapes.look[item]
-    footprint = t * pitch / view.intrinsics[0] / np.sqrt(max(facing, 0.05))
+    footprint = t * PAINT_BLUR_PX / view.intrinsics[0] / np.sqrt(max(facing, 0.05))
     paint = _albedo(colours, looks, row, u, v, footprint)
     return nx, ny, nz, _shade(light, looks[row, 8], looks[row, 9], paint, lamp, px, py, pz, nx, ny, nz, dx, dy, dz)
 
@@ -661,7 +676,7 @@ def _look_centre(view, standing, column, row, out, stack, entries):
 
 @_inline
 def _look_sample(view, standing, light, colours, samples, column, row, k, out, stack, entries):
-    dx, dy, dz = _ray(view, column + (k % samples + 0.5) / samples, row + (k // samples + 0.5) / samples)
+    dx, dy, dz = _sample_ray(view, column, row, k, samples)
     o = view.centre
     hit = _first_hit(standing, o[0], o[1], o[2], dx, dy, dz, NOWHERE, stack, entries, False)
     out.depth[row, column, k] = hit[0]
@@ -669,9 +684,7 @@ def _look_sample(view, standing, light, colours, samples, column, row, k, out, s
     if hit[1] >= 0:
         px, py, pz = o[0] + hit[0] * dx, o[1] + hit[0] * dy, o[2] + hit[0] * dz
         lamp = k % len(light.lamps)
-        nx, ny, nz, shade = _appearance(
-            view, standing, light, colours, hit, px, py, pz, dx, dy, dz, 1.0 / samples, lamp
-        )
+        nx, ny, nz, shade = _appearance(view, standing, light, colours, hit, px, py, pz, dx, dy, dz, lamp)
         if shade[4] > 0 and not _lit(standing, light, lamp, px, py, pz, nx, ny, nz, stack, entries):
             shade = (shade[0], shade[1], shade[2], BLACK, BLACK, BLACK)
     _store(out.normal, row, column, k, nx, ny, nz)
@@ -712,13 +725,13 @@ def _store(values, row, column, k, x, y, z):
 def _sample(view, backdrop, standing, movers, blockers, light, colours, column, row, k, stack, entries):
     """Radiance along one ray of a pixel."""
     samples = int(np.sqrt(backdrop.depth.shape[2]) + 0.5)
-    dx, dy, dz = _ray(view, column + (k % samples + 0.5) / samples, row + (k // samples + 0.5) / samples)
+    dx, dy, dz = _sample_ray(view, column, row, k, samples)
     o, behind, lamp = view.centre, np.float64(backdrop.depth[row, column, k]), k % len(light.lamps)
     hit = _first_hit(movers, o[0], o[1], o[2], dx, dy, dz, behind, stack, entries, False)
     t = hit[0]
     px, py, pz = o[0] + t * dx, o[1] + t * dy, o[2] + t * dz
     if hit[1] >= 0:
-        nx, ny, nz, shade = _appearance(view, movers, light, colours, hit, px, py, pz, dx, dy, dz, 1.0 / samples, lamp)
+        nx, ny, nz, shade = _appearance(view, movers, light, colours, hit, px, py, pz, dx, dy, dz, lamp)
         ar, ag, ab, kr, kg, kb = shade
         lit = kg > 0 and _lit(standing, light, lamp, px, py, pz, nx, ny, nz, stack, entries)
     else:

@@ -54,8 +54,8 @@ class RigOptions:
     def __post_init__(self) -> None:
         if not NEAREST_M <= self.radius_m <= FARTHEST_M:
             raise ValueError(
-                f"the rig's radius must be {NEAREST_M} to {FARTHEST_M} m, so that cameras stand between the scene and the "
-                f"furniture, but is {self.radius_m}"
+                f"the rig's radius must be {NEAREST_M} to {FARTHEST_M} m, so that cameras stand between the scene and "
+                f"the furniture, but is {self.radius_m}"
             )
         if self.height_m is not None and self.kind is RigKind.DOME:
             raise ValueError(

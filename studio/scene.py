@@ -16,7 +16,7 @@ import numpy as np
 from studio.figure import STRIDE_M, Clothes, Pose, add_figure
 from studio.furniture import DOOR_LEFT, DOOR_RIGHT, DOOR_TOP, HALF_X, HALF_Y, HEIGHT, LAMP, add_furniture, add_room
 from studio.geometry import Look, Parts, turn_about_z
-from studio.raycast import Light, Paints, paints
+from studio.raycast import Light, Paints, Shapes, paints
 from studio.standing import VOXEL_M, clearance_of
 from studio.textures import Textures, paint_textures
 

@@ -7,8 +7,11 @@ any distance, and a picture whose PSNR means something.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 
@@ -63,8 +66,9 @@ def paint_textures(seed: int) -> Textures:
     """Paint all textures; each has a random stream of its own, so that adding one changes no other."""
     texels, starts, sizes = [], [], []
     total = 0
-    for row, paint in enumerate(PAINTERS.values()):
-        levels = _halvings(paint(np.random.default_rng([seed, 1, row])))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        painted = list(pool.map(_paint, repeat(seed), range(len(PAINTERS))))
+    for levels in painted:
         offsets = total + np.cumsum([0] + [len(level) * level.shape[1] for level in levels])
         starts.append(np.append(offsets[:-1], np.full(LEVELS - len(levels), offsets[len(levels) - 1])))
         sizes.append((levels[0].shape[1], levels[0].shape[0], len(levels)))
@@ -78,12 +82,16 @@ def paint_textures(seed: int) -> Textures:
     )
 
 
+def _paint(seed: int, row: int) -> list[np.ndarray]:
+    return _halvings(list(PAINTERS.values())[row](np.random.default_rng([seed, 1, row])))
+
+
 def _halvings(picture: np.ndarray) -> list[np.ndarray]:
     """The picture as uint8 and its halved copies, averaged in linear light, down to a side of one texel."""
     height, width = picture.shape[:2]
     if height & (height - 1) or width & (width - 1):
         raise ValueError(f"a texture's sides must be powers of two, but are {width}x{height}")
-    light = linear_from_srgb(np.clip(picture, 0, 1)).astype(np.float32)
+    light: np.ndarray = linear_from_srgb(np.clip(picture, 0, 1)).astype(np.float32)
     levels = [light]
     while min(light.shape[:2]) > 1 and len(levels) < LEVELS:
         light = (light[::2, ::2] + light[1::2, ::2] + light[::2, 1::2] + light[1::2, 1::2]) / 4
@@ -467,7 +475,14 @@ def _notices(rng: np.random.Generator) -> np.ndarray:
 
 def _binding(rng: np.random.Generator) -> Paint:
     """Leather, linen or paper: brown, red, green, blue or pale, never bright."""
-    kinds = ((0.40, 0.24, 0.14), (0.46, 0.13, 0.12), (0.16, 0.30, 0.20), (0.14, 0.20, 0.36), (0.74, 0.68, 0.54), (0.2, 0.2, 0.22))
+    kinds = (
+        (0.40, 0.24, 0.14),
+        (0.46, 0.13, 0.12),
+        (0.16, 0.30, 0.20),
+        (0.14, 0.20, 0.36),
+        (0.74, 0.68, 0.54),
+        (0.2, 0.2, 0.22),
+    )
     r, g, b = np.array(kinds[rng.integers(len(kinds))]) * rng.uniform(0.75, 1.3) + rng.uniform(-0.05, 0.05, 3)
     return float(np.clip(r, 0.05, 0.9)), float(np.clip(g, 0.05, 0.9)), float(np.clip(b, 0.05, 0.9))
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,15 @@ from studio.scene import MOVING, OBJECTS
 VERSION = 1
 MOVES, SEEN = 1, 2
 """Bits of the flags"""
+
+
+class Recording(NamedTuple):
+    """What is decided about a camera before it films."""
+
+    camera: StudioCamera
+    times: CameraTimes
+    gains: np.ndarray
+    """float64 [3]: factors r g b on linear light that its exposure and white balance apply"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +75,9 @@ class CameraTruth:
             FileNotFoundError: the capture was made with light truth.
         """
         if not 0 <= index < len(self):
-            raise IndexError(f"camera {self.camera.name!r} recorded {len(self)} frames, numbered from 0; asked for {index}")
+            raise IndexError(
+                f"camera {self.camera.name!r} recorded {len(self)} frames, numbered from 0; asked for {index}"
+            )
         if not self.path.is_file():
             raise FileNotFoundError(f"no file {self.path}; simulate with truth 'full' to have depth, flow and masks")
         with np.load(self.path) as data:
@@ -118,9 +129,9 @@ def truth_json(
     fps: Fraction,
     ticks_ns: np.ndarray,  # int64 [T]
     entrance_ns: int,
-    cameras: Mapping[str, tuple[StudioCamera, CameraTimes, np.ndarray]],
+    recordings: Sequence[Recording],
 ) -> dict[str, Any]:
-    """Contents of truth.json; the cameras' arrays are gains, float64 [3]."""
+    """Contents of truth.json."""
     return {
         "version": VERSION,
         "options": dict(options),
@@ -129,7 +140,7 @@ def truth_json(
         "entrance_ns": entrance_ns,
         "objects": list(OBJECTS),
         "movers": list(MOVING),
-        "cameras": {name: _camera_to_json(*parts) for name, parts in cameras.items()},
+        "cameras": {recording.camera.name: _camera_to_json(*recording) for recording in recordings},
     }
 
 
@@ -196,8 +207,7 @@ def _camera_to_json(camera: StudioCamera, times: CameraTimes, gains: np.ndarray)
 
 def _camera_from_json(name: str, item: Mapping[str, Any], folder: Path) -> CameraTruth:
     pose = np.array(item["camera_from_world"], dtype=np.float64)
-    times = CameraTimes(
-        **{key: np.array(item[key], np.int64) for key in _TIMES}, **{key: item[key] for key in _CLOCK}
-    )
+    arrays = {key: np.array(item[key], np.int64) for key in _TIMES}
+    times = CameraTimes(**arrays, **{key: item[key] for key in _CLOCK})  # type: ignore[arg-type]
     camera = StudioCamera(name, **{key: item[key] for key in _LENS}, camera_from_world=pose)
     return CameraTruth(camera, times, np.array(item["gains"], dtype=np.float64), folder / f"{name}.npz")

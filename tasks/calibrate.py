@@ -57,6 +57,8 @@ class PointOptions:
 
     triangulate: TriangulateOptions = field(default_factory=TriangulateOptions)
     balance: BalanceOptions = field(default_factory=BalanceOptions)
+    more_instants: tuple[int, ...] = (15, 30)
+    """Instants after the first whose points tell colours too: cameras that start late have none in the first"""
 
 
 def find_rig(workshop: Workshop, plan: Plan, groups: Key, options: RigOptions) -> Key:
@@ -77,13 +79,11 @@ def find_rig(workshop: Workshop, plan: Plan, groups: Key, options: RigOptions) -
 
 
 def find_points(workshop: Workshop, plan: Plan, groups: Key, rig: Key, options: PointOptions) -> Key:
-    """Triangulate points at the first instant and balance the colours: points.npz, rig.json with gains, colour.json.
+    """Triangulate points and balance the colours: points.npz of the first instant, rig.json with gains, colour.json.
 
     Only fitted cameras take part; the others keep a gain of 1.
     """
-    footage = Footage(
-        plan.capture, workshop.path(groups), workshop.path(rig), tuple(plan.videos), plan.first, plan.first + 1
-    )
+    footage = Footage(plan.capture, workshop.path(groups), workshop.path(rig), tuple(plan.videos), plan.first, None)
     arguments = {"footage": footage, "fitted": plan.fitted, "options": options}
     reads = {"points": options, "cameras": list(plan.videos), "fitted": plan.fitted, "first": plan.first}
     inputs = {"groups": groups, "rig": rig}
@@ -137,10 +137,13 @@ def build_points(
 ) -> dict[str, Any]:
     """The job behind `find_points`."""
     rig = footage.load_rig()
-    pictures = {name: picture for name, picture in filmed(footage, 0).items() if name in fitted}
+    count = len(footage.load_groups().times_ns)
+    chosen = [0, *(instant for instant in options.more_instants if 0 < instant < count)]
+    shown = ({name: picture for name, picture in filmed(footage, instant).items() if name in fitted}
+             for instant in chosen)  # fmt: skip
     progress(0, 1, "matching features")
     try:
-        points = triangulate(rig.select(fitted), [pictures], options=options.triangulate)
+        points = triangulate(rig.select(fitted), shown, options=options.triangulate)
     except ValueError as problem:  # the rig was judged before: it is the scene that shows too little
         rig.save(out / RIG)
         return {"points": 0, "balanced": False, "reason": str(problem)}

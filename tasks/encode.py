@@ -17,7 +17,7 @@ from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.segment import Segment
 from packuv.stream import in_storage_order
 from sync.align import SyncReport
-from tasks.footage import Footage, PictureOptions, lens_camera
+from tasks.footage import Footage, PictureOptions, footage_of, lens_camera
 from tasks.jobs import Progress
 from tasks.plan import Plan
 from tasks.splat import SEGMENT
@@ -40,15 +40,7 @@ def encode(
 ) -> Key:
     """Write the scene file from the segments, in order."""
     arguments = {
-        "footage": Footage(
-            plan.capture,
-            workshop.path(groups),
-            workshop.path(points),
-            tuple(plan.videos),
-            plan.first,
-            plan.stop,
-            pictures.max_width,
-        ),
+        "footage": footage_of(workshop, plan, groups, points, cameras=tuple(plan.videos), pictures=pictures),
         "held_out": plan.held_out,
         "key": workshop.path(first_key),
         "segments": [workshop.path(key) / SEGMENT for key in segments],

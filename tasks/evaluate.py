@@ -24,7 +24,7 @@ from sync.capture import find_capture, load_timecodes
 from sync.clock import ClockMode
 from sync.probe import probe_video
 from tasks.encode import SCENE
-from tasks.footage import Footage, PictureOptions
+from tasks.footage import Footage, PictureOptions, footage_of
 from tasks.jobs import Progress
 from tasks.plan import Plan
 from tasks.report_facts import FrameScore, frames_to_picture
@@ -86,15 +86,7 @@ def evaluate(
     if not plan.held_out:
         workshop.listener.skipped("unseen scores", f"no camera is held out; scored on fitted {', '.join(cameras)}")
     arguments = {
-        "footage": Footage(
-            plan.capture,
-            workshop.path(groups),
-            workshop.path(points),
-            cameras,
-            plan.first,
-            plan.stop,
-            pictures.max_width,
-        ),
+        "footage": footage_of(workshop, plan, groups, points, cameras=cameras, pictures=pictures),
         "scene": workshop.path(scene) / SCENE,
         "options": options,
     }

@@ -13,7 +13,10 @@ from packuv.camera import PinholeCamera
 from packuv.frames import LensCamera, Views
 from sync.align import FrameGroups
 from sync.capture import find_capture
+from tasks.plan import Plan
+from tasks.store import Key
 from tasks.synchronize import selected
+from tasks.workshop import Workshop
 
 RIG = "rig.json"
 """Name of the rig's file in artefacts"""
@@ -69,6 +72,21 @@ class Footage:
         videos = find_capture(self.capture).videos
         lenses = [lens_camera(rig[name]) for name in names]
         return Views(videos, np.ascontiguousarray(groups.frames[:, columns]), lenses, max_width=self.max_width)
+
+
+def footage_of(
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    rig: Key,
+    *,
+    cameras: Sequence[str],
+    pictures: PictureOptions | None = None,
+) -> Footage:
+    """Pictures of these cameras in a plan's instants, with the rig of an artefact; without options as filmed."""
+    max_width = pictures.max_width if pictures else None
+    folders = workshop.path(groups), workshop.path(rig)
+    return Footage(plan.capture, *folders, tuple(cameras), plan.first, plan.stop, max_width)
 
 
 def lens_camera(camera: Camera) -> LensCamera:

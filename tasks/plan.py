@@ -23,7 +23,6 @@ class Plan:
     """The instant after the last one; None: to the end"""
     device: str
     """cpu or cuda"""
-    seed: int
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.held_out if name not in self.videos]:
@@ -37,8 +36,3 @@ class Plan:
     def fitted(self) -> tuple[str, ...]:
         """Cameras that the fit sees, in the capture's order."""
         return tuple(name for name in self.videos if name not in self.held_out)
-
-    @property
-    def instants(self) -> tuple[int, int | None]:
-        """Half-open range of the capture's instants."""
-        return self.first, self.stop

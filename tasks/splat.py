@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from packuv.solver import FitOptions
 from packuv.start import Points, Sights
 from packuv.stream import hold_absent
 from tasks.calibrate import POINTS
-from tasks.footage import Footage, PictureOptions
+from tasks.footage import Footage, PictureOptions, footage_of
 from tasks.jobs import Progress
 from tasks.plan import Plan
 from tasks.store import Key
@@ -39,7 +38,7 @@ def fit_first(
     """Fit the first keyframe: state.npz and key.json, which holds the quantizer of the whole sequence."""
     options = _without(options, "key_iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "labels")
     arguments = {
-        "footage": _footage(workshop, plan, groups, points, pictures),
+        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "points": workshop.path(points) / POINTS,
         "options": options,
     }
@@ -62,7 +61,7 @@ def fit_next(
     """Fit the keyframe at instant `step[1]` from the one at `step[0]`."""
     options = _without(options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift")
     arguments = {
-        "footage": _footage(workshop, plan, groups, points, pictures),
+        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "previous": workshop.path(previous),
         "instant": step[1],
         "motion": motion,
@@ -88,7 +87,7 @@ def fit_segment(
     """Fit the instants of a segment, which starts with its keyframe: segment.npz and fit.json."""
     options = _without(options, "iterations", "key_iterations", "coarse_share", "float_share", "start")
     arguments = {
-        "footage": _footage(workshop, plan, groups, points, pictures),
+        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "key": workshop.path(key),
         "motion": workshop.path(motion) / MOTION,
         "span": (span.start, span.stop),
@@ -153,26 +152,16 @@ def build_segment(
 
 
 def _evidence(sparse: SparsePoints, rig: Rig) -> tuple[Points, Sights]:
-    """Where surfaces surely are, and what cameras look through."""
-    sure = sparse.views >= SURE_VIEWS
+    """Where surfaces surely are at the first instant, and what cameras look through."""
+    sure = (sparse.views >= SURE_VIEWS) & (sparse.instant == 0)
+    seen = sure[sparse.point]
     centres = rig.select(sparse.cameras).centres  # [C, 3], world
-    return Points(sparse.xyz[sure], sparse.rgb[sure] / 255), Sights(centres[sparse.camera], sparse.xyz[sparse.point])
+    sights = Sights(centres[sparse.camera[seen]], sparse.xyz[sparse.point[seen]])
+    return Points(sparse.xyz[sure], sparse.rgb[sure] / 255), sights
 
 
 def _changes(views: Views, first: int, last: int, options: MotionOptions) -> list[np.ndarray | None]:
     return [changed_between(views, camera, first, last, options) for camera in range(len(views.cameras))]
-
-
-def _footage(workshop: Workshop, plan: Plan, groups: Key, points: Key, pictures: PictureOptions) -> Footage:
-    return Footage(
-        plan.capture,
-        workshop.path(groups),
-        workshop.path(points),
-        plan.fitted,
-        plan.first,
-        plan.stop,
-        pictures.max_width,
-    )
 
 
 def _reads(plan: Plan, pictures: PictureOptions, options: FitOptions) -> dict[str, Any]:
@@ -195,8 +184,3 @@ def _without(options: FitOptions, *unread: str) -> FitOptions:
 
 def _counted(progress: Progress) -> Any:
     return lambda done, total: progress(done, total, "")
-
-
-def figures_of(workshop: Workshop, keys: list[Key]) -> list[Mapping[str, Any]]:
-    """What the fits of these artefacts measured, from their receipts."""
-    return [workshop.store.receipt(key).notes for key in keys]

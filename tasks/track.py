@@ -12,7 +12,7 @@ from packuv.files import write_json
 from packuv.keyframes import KeyframeOptions, motion_curve, segments
 from packuv.keyframes import choose_keyframes as choose
 from packuv.motion import MotionCache, MotionOptions, measure_motion
-from tasks.footage import Footage, PictureOptions
+from tasks.footage import Footage, PictureOptions, footage_of
 from tasks.jobs import Progress
 from tasks.plan import Plan
 from tasks.recipe import digest
@@ -29,15 +29,7 @@ def find_motion(
 ) -> Key:
     """Measure flow and motion masks of the fitted cameras."""
     arguments = {
-        "footage": Footage(
-            plan.capture,
-            workshop.path(groups),
-            workshop.path(rig),
-            plan.fitted,
-            plan.first,
-            plan.stop,
-            pictures.max_width,
-        ),
+        "footage": footage_of(workshop, plan, groups, rig, cameras=plan.fitted, pictures=pictures),
         "options": options,
         "workers": workshop.jobs.threads,
     }

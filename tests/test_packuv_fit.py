@@ -126,15 +126,15 @@ def test_a_segment_follows_the_ball_and_freezes_the_rest(views, key, motion, tmp
 def test_a_segment_that_was_cut_off_goes_on_to_the_same_codes(views, key, motion, tmp_path):
     whole, _ = fit_segment(key, views, range(FRAMES), motion=motion, options=OPTIONS, scratch=_made(tmp_path / "a"))
 
-    class Cut(Exception):
+    class CutOffError(Exception):
         pass
 
     def stop_after_two(done: int, total: int) -> None:
         if done == 2:
-            raise Cut
+            raise CutOffError
 
     scratch = _made(tmp_path / "b")
-    with pytest.raises(Cut):
+    with pytest.raises(CutOffError):
         fit_segment(key, views, range(FRAMES), motion=motion, options=OPTIONS, scratch=scratch, progress=stop_after_two)
     assert (scratch / "track.json").exists()
     resumed, figures = fit_segment(key, views, range(FRAMES), motion=motion, options=OPTIONS, scratch=scratch)

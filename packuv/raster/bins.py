@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from packuv.raster.kernel import kernel
 from packuv.raster.project import (
     CHUNKS,
     DEPTH,
@@ -18,10 +17,9 @@ from packuv.raster.project import (
     X,
     Y,
 )
-from packuv.raster.simd import LANES_16, at_least, at_most, bits, both, larger, load, prefetch, splat, square_root
+from packuv.raster.simd import ALL, at_least, at_most, bits, both, larger, load, prefetch, splat, square_root, zeros
 
 _f32 = np.float32
-_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True}
 _ROWS = (np.arange(TILE) + 0.5).astype(np.float32)
 _RADIX_BITS = 11
 _AHEAD = 8
@@ -31,7 +29,7 @@ _AHEAD = 8
 GAUSSIAN, SLOT, MASK = range(3)
 
 
-@njit(**_OPTIONS)
+@kernel()
 def drawn(cells, record, order, keys):
     """Collect the Gaussians that are drawn; their keys are the bits of a positive float, which sort like it."""
     count = 0
@@ -43,7 +41,7 @@ def drawn(cells, record, order, keys):
     return count
 
 
-@njit(**_OPTIONS)
+@kernel()
 def sort_by_depth(count, order, keys, other_order, other_keys, histogram):
     """Stable radix sort in three passes of 11 bits; the result is in `other_order`. Keys are uint32 [N]."""
     histogram[:] = 0
@@ -59,7 +57,7 @@ def sort_by_depth(count, order, keys, other_order, other_keys, histogram):
     _sort_digit(count, 2, order, keys, other_order, other_keys, histogram)
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True)
 def _sort_digit(count, digit, order, keys, to_order, to_keys, histogram):
     shift = np.uint32(_RADIX_BITS * digit)
     for i in range(count):
@@ -69,7 +67,7 @@ def _sort_digit(count, digit, order, keys, to_order, to_keys, histogram):
         to_keys[at], to_order[at] = keys[i], order[i]
 
 
-@njit(**_OPTIONS)
+@kernel()
 def running_sum(counts, out):
     """Exclusive prefix sum, int64 [N + 1]; returns the total."""
     total = 0
@@ -80,49 +78,37 @@ def running_sum(counts, out):
     return total
 
 
-@njit(**_OPTIONS)
-def _spread(rows, column, lanes):
-    """Mask of the blocks of one column of blocks, from 16 bits, one per row of pixels."""
-    rows |= rows >> 1
-    if len(lanes) == 16:  # a block has 4 rows: bits 0, 4, 8, 12 are in place
-        rows |= rows >> 2
-        return (rows & 0x1111) << column
-    rows &= 0x5555  # a block has 2 rows: move bit 2 k to 4 k
-    rows = (rows | (rows << 8)) & 0x00FF00FF
-    rows = (rows | (rows << 4)) & 0x0F0F0F0F
-    return ((rows | (rows << 2)) & 0x11111111) << column
-
-
-@njit(**_OPTIONS)
-def _mask_row(lanes, record, g, tile_y, x0, x1, row_bits, active, tiles, masks, at):
+@kernel(inner=True)
+def _mask_row(record, g, tile_y, x0, x1, row_bits, active, tiles, masks, at):
     """Append the tiles of one tile row that the outline of Gaussian g reaches; returns the end of the list.
 
-    In each row of pixels the outline covers one interval, so the test of pixel centres against it is exact.
+    In each row of pixels the outline covers one interval, so the test of pixel centres against it is exact. Bit
+    4 j + i of a mask is the block in row j and column i of blocks.
     """
     r = g * 16
-    dy = load(LANES_16, _ROWS, 0) - splat(LANES_16, record[r + Y] - _f32(TILE * tile_y))
-    room = splat(LANES_16, record[r + REACH]) - dy * dy * splat(LANES_16, record[r + INVERSE_VARIANCE_Y])
-    zero = splat(LANES_16, _f32(0))
-    half = square_root(larger(room * splat(LANES_16, record[r + INVERSE_XX]), zero))
-    centre = splat(LANES_16, record[r + X]) - splat(LANES_16, record[r + SHEAR]) * dy
+    dy = load(_ROWS, 0) - splat(record[r + Y] - _f32(TILE * tile_y))
+    room = splat(record[r + REACH]) - dy * dy * splat(record[r + INVERSE_VARIANCE_Y])
+    half = square_root(larger(room * splat(record[r + INVERSE_XX]), zeros(ALL)))
+    centre = splat(record[r + X]) - splat(record[r + SHEAR]) * dy
     low, high = centre - half, centre + half
-    row_bits &= bits(at_least(room, zero))
+    row_bits &= bits(at_least(room, zeros(ALL)))
     for tile_x in range(x0, x1 + 1):
         if active[tile_y, tile_x] == 0:
             continue
         mask = np.int64(0)
         for column in range(4):
             first = _f32(TILE * tile_x + 4 * column) + _f32(0.5)
-            reached = both(at_least(high, splat(LANES_16, first)), at_most(low, splat(LANES_16, first + _f32(3))))
-            mask |= _spread(bits(reached) & row_bits, column, lanes)
+            rows = bits(both(at_least(high, splat(first)), at_most(low, splat(first + _f32(3))))) & row_bits
+            rows |= rows >> 1
+            mask |= ((rows | (rows >> 2)) & 0x1111) << column
         if mask != 0:
             tiles[at], masks[at] = tile_y * active.shape[1] + tile_x, mask
             at += 1
     return at
 
 
-@njit(parallel=True, **_OPTIONS)
-def find_tiles(lanes, box, cells, first_cell, record, active, height, tiles, masks, hits):
+@kernel(parallel=True)
+def find_tiles(box, cells, first_cell, record, active, height, tiles, masks, hits):
     """List the tiles of each Gaussian from its first cell on: tile number, block mask; `hits` [N] counts them."""
     count = cells.shape[0]
     for chunk in prange(CHUNKS):
@@ -133,12 +119,12 @@ def find_tiles(lanes, box, cells, first_cell, record, active, height, tiles, mas
             at = first_cell[g]
             for tile_y in range(box[g, 1], box[g, 3] + 1):
                 rows = min(TILE, height - TILE * tile_y)
-                at = _mask_row(lanes, record, np.int64(g), tile_y, box[g, 0], box[g, 2], (1 << rows) - 1, active,
+                at = _mask_row(record, np.int64(g), tile_y, box[g, 0], box[g, 2], (1 << rows) - 1, active,
                                tiles, masks, at)  # fmt: skip
             hits[g] = at - first_cell[g]
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def count_pairs(count, order, first_cell, hits, tiles, histogram):
     """Pairs per chunk of the depth order and tile, int32 [CHUNKS, tiles]."""
     for chunk in prange(histogram.shape[0]):
@@ -152,7 +138,7 @@ def count_pairs(count, order, first_cell, hits, tiles, histogram):
                 histogram[chunk, tiles[cell]] += 1
 
 
-@njit(**_OPTIONS)
+@kernel()
 def start_tiles(histogram, start):
     """Turn counts into positions, tile by tile and chunk by chunk; `start` [tiles + 1] bounds each tile's list."""
     total = 0
@@ -164,7 +150,7 @@ def start_tiles(histogram, start):
     return total
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def scatter_pairs(count, order, first_cell, first_pair, tiles, masks, histogram, pairs):
     """Write the lists, uint32 [pairs, 3]; a slot is the place of a pair when pairs are grouped by Gaussian."""
     for chunk in prange(histogram.shape[0]):

@@ -22,7 +22,7 @@ from packuv.quantize import Gaussians
 from packuv.raster import bins, blend
 from packuv.raster.project import CHUNKS, RECORD, TILE, project, project_backward, view_constants
 from packuv.raster.sh import MAX_DEGREE
-from packuv.raster.simd import Lanes, preferred_lanes
+from packuv.raster.simd import WIDTH, Lanes, register_lanes
 
 BIN_CHUNKS = 16
 """Pieces of the depth order that are put into tiles side by side."""
@@ -100,7 +100,7 @@ class _Kept:
     gaussians: Gaussians
     view: np.ndarray
     sh_degree: int
-    lanes: Lanes
+    sums: Lanes
     workspace: Workspace
     record: np.ndarray  # float32 [N, 16]
     first_pair: np.ndarray  # int64 [N + 1]
@@ -139,7 +139,7 @@ class Rendering:
     @property
     def evaluation_count(self) -> int:
         """(Gaussian, pixel) pairs that were computed, idle lanes included."""
-        return int(self._kept.visited.sum()) * len(self._kept.lanes)
+        return int(self._kept.visited.sum()) * WIDTH
 
 
 @dataclass(frozen=True)
@@ -177,26 +177,27 @@ def forward(
     tiles: np.ndarray | None = None,
     weights: bool = False,
     workspace: Workspace | None = None,
-    lanes: Lanes | None = None,
+    sums: Lanes | None = None,
 ) -> Rendering:
     """Render N Gaussians.
 
     `tiles`, bool as `tile_shape(camera)`, limits the work: elsewhere the picture shows background, alpha 0.
     `sh_degree` may be less than the Gaussians carry. `weights` asks for the blending weight of each Gaussian.
-    `lanes` is for tests and benchmarks. Raises ValueError if shapes or types do not fit.
+    `sums`, the width of running sums in the gradients, is for tests and benchmarks. Raises ValueError if shapes or
+    types do not fit.
     """
     prefer_tbb()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     _check(gaussians, degree)
-    lanes, workspace = lanes or preferred_lanes(), workspace or Workspace()
+    sums, workspace = sums or register_lanes(), workspace or Workspace()
     active = checked_tiles(tiles, camera)
     view = view_constants(camera, options.near, options.low_pass_px2)
     record, box, cells, invalid = _project(gaussians, degree, view, active, workspace)
-    visible, first_pair, pairs, start = _bin(record, box, cells, active, camera.height, lanes, workspace)
-    kept = _Kept(gaussians, view, degree, lanes, workspace, record, first_pair, pairs, start,
+    visible, first_pair, pairs, start = _bin(record, box, cells, active, camera.height, workspace)
+    kept = _Kept(gaussians, view, degree, sums, workspace, record, first_pair, pairs, start,
                  workspace.take(len(start) - 1, np.int64), workspace.take(len(start) - 1, np.int32))  # fmt: skip
-    colour, depth, alpha, sums = _blend(kept, camera, np.asarray(background, np.float32), weights)
-    return Rendering(colour, depth, alpha, visible, sums, invalid, kept)
+    colour, depth, alpha, shares = _blend(kept, camera, np.asarray(background, np.float32), weights)
+    return Rendering(colour, depth, alpha, visible, shares, invalid, kept)
 
 
 def backward(
@@ -220,7 +221,7 @@ def backward(
     height, width = rendering.alpha.shape
     pair_count = len(kept.pairs)
     partial, used = workspace.take(pair_count * RECORD, np.float32), workspace.take(pair_count, np.uint8)
-    blend.blend_backward(kept.lanes, kept.record.reshape(-1), kept.pairs, kept.start, kept.used_end, -(-width // TILE),
+    blend.blend_backward(kept.sums, kept.record.reshape(-1), kept.pairs, kept.start, kept.used_end, -(-width // TILE),
                          width, height, *(p.reshape(-1) for p in pictures), *upstream, chosen, partial, used,
                          _jobs())  # fmt: skip
     shapes = [(count, 3), (count, 3), (count, 4), (count,), gaussians.sh.shape, (count, 2)]
@@ -299,7 +300,7 @@ def _project(gaussians: Gaussians, degree: int, view: np.ndarray, active: np.nda
     return record, box, cells, int(invalid.sum())
 
 
-def _bin(record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndarray, height: int, lanes: Lanes,
+def _bin(record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndarray, height: int,
          workspace: Workspace) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Tiles per Gaussian, first pair per Gaussian, pairs in tile and depth order, bounds of the tiles' lists."""
     count, take = len(cells), workspace.take
@@ -310,7 +311,7 @@ def _bin(record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndar
     first_cell, first_pair = take(count + 1, np.int64), take(count + 1, np.int64)
     cell_count = bins.running_sum(cells, first_cell)
     tiles, masks, visible = take(cell_count, np.int32), take(cell_count, np.uint32), take(count, np.int32)
-    bins.find_tiles(lanes, box, cells, first_cell, record.reshape(-1), active, height, tiles, masks, visible)
+    bins.find_tiles(box, cells, first_cell, record.reshape(-1), active, height, tiles, masks, visible)
     pairs = take((int(bins.running_sum(visible, first_pair)), 3), np.uint32)
     histogram, start = take((BIN_CHUNKS, active.size), np.int64), take(active.size + 1, np.int64)
     bins.count_pairs(drawn, order[1], first_cell, visible, tiles, histogram)
@@ -330,7 +331,7 @@ def _blend(kept: _Kept, camera: PinholeCamera, background: np.ndarray, weights: 
     )
     pair_count = len(kept.pairs)
     partial = take(pair_count * RECORD if weights else 0, np.float32)
-    blend.blend(kept.lanes, kept.record.reshape(-1), kept.pairs, kept.start, tile_shape(camera)[1], width, height,
+    blend.blend(kept.sums, kept.record.reshape(-1), kept.pairs, kept.start, tile_shape(camera)[1], width, height,
                 background, colour.reshape(-1), depth.reshape(-1), alpha.reshape(-1), kept.used_end, kept.visited,
                 partial, _jobs())  # fmt: skip
     if not weights:

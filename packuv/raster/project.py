@@ -8,13 +8,13 @@ skipped and counted: an attribute that is not finite, a position beyond `MAX_LEN
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from packuv.camera import PinholeCamera
 from packuv.raster import sh as harmonics
+from packuv.raster.kernel import kernel
 
 TILE = 16
 """Pixels along a side of a tile."""
@@ -29,7 +29,7 @@ MARGIN = 0.15
 """The local linear map of a Gaussian outside the picture is taken at most this share of the picture beyond its edge."""
 
 # Columns of a record: one Gaussian as the blending needs it, a cache line of 16 float32.
-# alpha = 2 ** (LOG_OPACITY + XX dx^2 + XY dx dy + YY dy^2)
+# alpha = 2 ** (8 (LOG_OPACITY + XX dx^2 + XY dx dy + YY dy^2)), the argument that `simd.exp2_8` takes
 X, Y, XX, XY, YY, LOG_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
 # The outline where alpha = 1/255, for the exact test of rows of pixels against it:
 SHEAR, INVERSE_XX, INVERSE_VARIANCE_Y, REACH = range(10, 14)
@@ -39,9 +39,10 @@ RECORD = 16
 _ROTATION, _TRANSLATION, _FX, _FY, _CX, _CY, _CENTRE, _WIDTH, _HEIGHT = 0, 9, 12, 13, 14, 15, 16, 19, 20
 _SLOPE_LIMITS, _NEAR, _LOW_PASS = 21, 25, 26
 
+EXPONENT_UNIT = 8.0
 _LOG2E = 1.4426950408889634
 _f32 = np.float32
-_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True, "fastmath": {"contract", "nsz"}}
+_FAST = frozenset({"contract", "nsz"})
 
 
 def view_constants(camera: PinholeCamera, near: float, low_pass_px2: float) -> np.ndarray:
@@ -56,7 +57,7 @@ def view_constants(camera: PinholeCamera, near: float, low_pass_px2: float) -> n
     ], dtype=np.float64)  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _in_camera(view, x, y, z):
     """A world point on the camera's axes."""
     return (
@@ -66,7 +67,7 @@ def _in_camera(view, x, y, z):
     )
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _linear_map(view, x, y, z):
     """Jacobian of the projection at a point on the camera's axes (4 entries that are not zero), and the same after the
     camera's rotation, [2, 3] by rows."""
@@ -80,7 +81,7 @@ def _linear_map(view, x, y, z):
     )  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _rotation(w, x, y, z):
     """Rotation matrix of a unit quaternion, by rows."""
     return (
@@ -90,7 +91,7 @@ def _rotation(w, x, y, z):
     )  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _screen_axes(u, r, s0, s1, s2):
     """The three axes of a Gaussian in the picture, pixels: M = U R S, [2, 3] by rows."""
     return (
@@ -103,7 +104,7 @@ def _screen_axes(u, r, s0, s1, s2):
     )
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _covariance(m, low_pass):
     """xx, xy, yy of M M^T plus the low-pass filter, pixels^2, and the determinant.
 
@@ -116,7 +117,7 @@ def _covariance(m, low_pass):
     return xx, xy, yy, n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (xx + yy) - low_pass * low_pass
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _is_valid(means, log_scales, quaternions, logits, i):
     length = max(abs(means[i, 0]), max(abs(means[i, 1]), abs(means[i, 2])))
     size = max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2]))
@@ -129,7 +130,7 @@ def _is_valid(means, log_scales, quaternions, logits, i):
     return math.isfinite(total + square) and length <= MAX_LENGTH and size <= MAX_LOG_SCALE and square > 1e-24
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _outline_box(view, x, y, xx, yy, reach, box, i):
     """Write the tiles [x0, y0, x1, y1], both ends included, that the outline's bounding box touches; False if none."""
     half_x, half_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
@@ -141,14 +142,14 @@ def _outline_box(view, x, y, xx, yy, reach, box, i):
     return True
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _active_tiles(active_sum, box, i):
     """Number of active tiles inside a box, from their summed-area table."""
     x0, y0, x1, y1 = box[i, 0], box[i, 1], box[i, 2] + 1, box[i, 3] + 1
     return active_sum[y1, x1] - active_sum[y0, x1] - active_sum[y1, x0] + active_sum[y0, x0]
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _direction(view, means, i):
     """Unit vector from the camera to a Gaussian, world, and one over the distance."""
     x, y, z = means[i, 0] - view[_CENTRE], means[i, 1] - view[_CENTRE + 1], means[i, 2] - view[_CENTRE + 2]
@@ -156,7 +157,7 @@ def _direction(view, means, i):
     return _f32(x * inverse), _f32(y * inverse), _f32(z * inverse), inverse
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _colour(view, means, sh, degree, values, record, i):
     """Write max(0, 0.5 + SH); False if it is not a usable number. `values` is scratch, float32 [16]."""
     x, y, z, _ = _direction(view, means, i)
@@ -170,7 +171,7 @@ def _colour(view, means, sh, degree, values, record, i):
     return abs(r) <= MAX_COLOUR and abs(g) <= MAX_COLOUR and abs(b) <= MAX_COLOUR
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
     """Fill the record (but for the colour) and the box of one valid Gaussian; False if it is not drawn."""
     x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
@@ -190,14 +191,15 @@ def _project_one(means, log_scales, quaternions, logits, view, active_sum, recor
     if not _outline_box(view, px, py, xx, yy, reach, box, i) or _active_tiles(active_sum, box, i) == 0:
         return False
     record[i, X], record[i, Y], record[i, DEPTH] = px, py, z
-    record[i, XX], record[i, YY] = -0.5 * _LOG2E * yy / determinant, -0.5 * _LOG2E * xx / determinant
-    record[i, XY], record[i, LOG_OPACITY] = _LOG2E * xy / determinant, math.log2(opacity)
+    scale = _LOG2E / EXPONENT_UNIT / determinant
+    record[i, XX], record[i, XY], record[i, YY] = -0.5 * scale * yy, scale * xy, -0.5 * scale * xx
+    record[i, LOG_OPACITY] = math.log2(opacity) / EXPONENT_UNIT
     record[i, SHEAR], record[i, INVERSE_VARIANCE_Y], record[i, REACH] = -xy / yy, 1.0 / yy, reach
     record[i, INVERSE_XX] = min(determinant / yy, 1e30)
     return True
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _unit(quaternions, i):
     w, x, y, z = (np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]),
                   np.float64(quaternions[i, 3]))  # fmt: skip
@@ -205,7 +207,7 @@ def _unit(quaternions, i):
     return w * inverse, x * inverse, y * inverse, z * inverse
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True, fastmath=_FAST)
 def project(means, log_scales, quaternions, logits, sh, degree, view, active_sum, record, box, cells, invalid):
     """Fill records [N, 16], boxes [N, 4] (tiles) and `cells` [N], the number of tiles in the box, 0 if not drawn.
 
@@ -231,7 +233,7 @@ def project(means, log_scales, quaternions, logits, sh, degree, view, active_sum
 # -- gradients ------------------------------------------------------------------------------------------------------
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _sum_pairs(partial, used, begin, end, out):
     """Sum the partial gradients of one Gaussian over its tiles, in their order; False if no tile drew it."""
     out[:] = _f32(0)
@@ -244,7 +246,7 @@ def _sum_pairs(partial, used, begin, end, out):
     return hit
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i):
     """Write the gradient of the coefficients; return that of the position through the viewing direction."""
     x, y, z, inverse = _direction(view, means, i)
@@ -262,7 +264,7 @@ def _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh,
     return (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _axes_gradient(m, xx, xy, yy, determinant, g):
     """Gradient of M [2, 3] by rows, from the moments of the exponent's gradient."""
     a, b, c = yy / determinant, -xy / determinant, xx / determinant  # the inverse covariance
@@ -275,7 +277,7 @@ def _axes_gradient(m, xx, xy, yy, determinant, g):
     )  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _quaternion_gradient(w, x, y, z, d, u):
     """Gradient of the unit quaternion, from d = dL/d(U R) [2, 3] and U [2, 3]."""
     r00, r01, r02 = u[0] * d[0] + u[3] * d[3], u[0] * d[1] + u[3] * d[4], u[0] * d[2] + u[3] * d[5]
@@ -289,7 +291,7 @@ def _quaternion_gradient(w, x, y, z, d, u):
     return gw - along * w, gx - along * x, gy - along * y, gz - along * z
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _map_gradient(view, d, r):
     """Gradient of the four entries of the projection's Jacobian, from d = dL/d(U R) and the rotation R."""
     e0, e1, e2 = (
@@ -308,7 +310,7 @@ def _map_gradient(view, d, r):
     )  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _point_gradient(view, x, y, z, g, screen, jacobian, d_jacobian):
     """Gradient of the position, world, from those of the picture's position, the depth and the Jacobian."""
     u, v = x / z, y / z
@@ -329,7 +331,7 @@ def _point_gradient(view, x, y, z, g, screen, jacobian, d_jacobian):
     )
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _project_one_backward(means, log_scales, quaternions, logits, view, g, d_log_scales, d_quaternions, d_logits,
                           d_screen, i):  # fmt: skip
     """Write every gradient of one Gaussian but those through its colour; return that of its position."""
@@ -362,7 +364,7 @@ def _project_one_backward(means, log_scales, quaternions, logits, view, g, d_log
     return _point_gradient(view, x, y, z, g, screen, jacobian, _map_gradient(view, d, r))
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
     d_means[i, :] = _f32(0)
     d_log_scales[i, :] = _f32(0)
@@ -372,7 +374,7 @@ def _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
     d_sh[i, :, :] = _f32(0)
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True, fastmath=_FAST)
 def _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
     total = np.float64(d_logits[i]) + d_screen[i, 0] + d_screen[i, 1]
     for k in range(3):
@@ -380,7 +382,7 @@ def _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i
     return math.isfinite(total + d_quaternions[i, 3])
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True, fastmath=_FAST)
 def project_backward(means, log_scales, quaternions, logits, sh, degree, view, record, rows, first_pair, used, partial,
                      d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, overflown):  # fmt: skip
     """Reduce the partial gradients [pairs, 16] of every chosen Gaussian and carry them to its parameters.

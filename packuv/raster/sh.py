@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit
+
+from packuv.raster.kernel import kernel
 
 MAX_DEGREE = 3
-_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True}
 
 _f32 = np.float32
 _C0 = _f32(0.28209479177387814)
@@ -19,7 +17,7 @@ _C3 = tuple(_f32(c) for c in (0.5900435899266435, 2.890611442640554, 0.457045799
 _2, _3, _4, _6, _8 = _f32(2), _f32(3), _f32(4), _f32(6), _f32(8)
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True)
 def basis(degree, x, y, z, out):
     """Write the (degree + 1) ** 2 basis values of the unit vector (x, y, z), float32, to `out` [16]."""
     out[0] = _C0
@@ -40,7 +38,7 @@ def basis(degree, x, y, z, out):
         out[15] = -_C3[0] * x * (xx - _3 * yy)
 
 
-@njit(**_OPTIONS)
+@kernel(inner=True)
 def direction_gradient(degree, x, y, z, d):
     """Gradient with respect to (x, y, z), from that with respect to the basis values, `d` [16]."""
     gx, gy, gz = _f32(0), _f32(0), _f32(0)

@@ -1,9 +1,9 @@
-"""Explicit SIMD for Numba: vectors of 8 or 16 float32 values.
+"""Explicit SIMD for Numba: vectors of 16 float32 values, as LLVM vectors.
 
-A vector is an LLVM vector, so the compiler maps it to what the machine has: 16 lanes are one register of AVX-512,
-8 lanes one register of AVX2, two of SSE or NEON. The width is the type of an argument: kernels take `lanes`, a tuple of
-that length, so one source compiles for both widths, the compile cache tells them apart, and one process can compare
-them. No operation may be contracted or reordered by the compiler: the same source gives the same bits in every kernel.
+The compiler maps a vector to what the machine has: one register of AVX-512, two of AVX2, four of SSE or NEON. Two
+registers side by side are no loss: they give the processor two independent chains of operations to overlap. Only sums
+that live through a loop are better kept in the width of one register, see `register_lanes`. No operation may be
+contracted or reordered by the compiler: the same source gives the same bits in every kernel.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from numba.core import cgutils
 from numba.extending import models, overload, register_model
 
 Lanes = tuple[int, ...]
-LANES_8: Lanes = (0,) * 8
-LANES_16: Lanes = (0,) * 16
+"""A width is the type of an argument, a tuple of that length: one source compiles for every width."""
+ALL: Lanes = (0,) * 16
+HALF: Lanes = (0,) * 8
+WIDTH = 16
 
 intrinsic: Any = extending.intrinsic
 # Numba's own type would count the typing context among the arguments.
@@ -29,18 +31,26 @@ intrinsic: Any = extending.intrinsic
 _I1, _I8, _I32, _I64, _F32 = ir.IntType(1), ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType()
 
 
-def preferred_lanes() -> Lanes:
-    """The width that fills one register of this CPU: 16 with AVX-512, else 8."""
-    return LANES_16 if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else LANES_8
+def register_lanes() -> Lanes:
+    """The lanes that fill one register of this CPU: 16 with AVX-512, else 8.
+
+    Sixteen lanes of AVX2 are two of the sixteen registers that there are, so running sums spill to memory; folded to
+    one register each they cost half as many loads and stores.
+    """
+    return ALL if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else HALF
 
 
 class FloatVector(types.Type):
+    """Numba's type of `count` float32 values."""
+
     def __init__(self, count: int):
         self.count = count
         super().__init__(name=f"float32x{count}")
 
 
 class MaskVector(types.Type):
+    """Numba's type of `count` truth values."""
+
     def __init__(self, count: int):
         self.count = count
         super().__init__(name=f"maskx{count}")
@@ -75,51 +85,63 @@ def _call(builder: ir.IRBuilder, name: str, result: ir.Type, arguments: list[ir.
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
 
 
+def _fma(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+    return _call(builder, f"llvm.fma.v{c.type.count}f32", c.type, [a, b, c])
+
+
 def _pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: ir.Value, index: ir.Value, to: ir.Type) -> ir.Value:
     """Address of flat element `index` of a C-contiguous array."""
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), to.as_pointer())
 
 
-# -- arithmetic and comparison --------------------------------------------------------------------------------------
+def _read(builder: ir.IRBuilder, address: ir.Value) -> ir.Value:
+    """A vector at any address that a float may have."""
+    value = builder.load(address, typ=address.type.pointee)
+    value.align = 4
+    return value
+
+
+def _write(builder: ir.IRBuilder, value: ir.Value, address: ir.Value) -> None:
+    builder.store(value, address).align = 4
+
+
+def _part(builder: ir.IRBuilder, vector: ir.Value, part: int, width: int) -> ir.Value:
+    """Lanes part * width and the `width` - 1 after it."""
+    if vector.type.count == width:
+        return vector
+    return _shuffle(builder, vector, vector, list(range(part * width, (part + 1) * width)))
+
+
+# -- arithmetic and comparison ----------------------------------------------------------------------------------------
 
 
 def _binary(instruction: str) -> Callable:
     @intrinsic
     def operation(typing, a, b):
-        if not (isinstance(a, FloatVector) and a == b):
-            return None
         return a(a, b), lambda context, builder, signature, args: getattr(builder, instruction)(*args)
 
     return operation
 
 
-def _operators() -> None:
-    for symbol, instruction in (
-        (operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv"),
-    ):  # fmt: skip
-        _overload_operator(symbol, _binary(instruction))
-
-
 def _overload_operator(symbol: Callable, operation: Callable) -> None:
-    @overload(symbol, inline="never")
+    @overload(symbol)
     def implementation(a, b):
-        if isinstance(a, FloatVector) and isinstance(b, FloatVector):
+        if isinstance(a, FloatVector) and a == b:
             return lambda a, b: operation(a, b)
         return None
 
 
-_operators()
+_overload_operator(operator.add, _binary("fadd"))
+_overload_operator(operator.sub, _binary("fsub"))
+_overload_operator(operator.mul, _binary("fmul"))
+_overload_operator(operator.truediv, _binary("fdiv"))
 
 
 @intrinsic
 def fma(typing, a, b, c):
     """a * b + c, rounded once."""
-
-    def generate(context, builder, signature, args):
-        return _call(builder, f"llvm.fma.v{a.count}f32", args[0].type, list(args))
-
-    return a(a, b, c), generate
+    return a(a, b, c), lambda context, builder, signature, args: _fma(builder, *args)
 
 
 @intrinsic
@@ -133,19 +155,20 @@ def square_root(typing, a):
 def _comparison(predicate: str) -> Callable:
     @intrinsic
     def operation(typing, a, b):
-        return (
-            MaskVector(a.count)(a, b),
-            lambda context, builder, signature, args: builder.fcmp_ordered(predicate, *args),
-        )
+        def generate(context, builder, signature, args):
+            return builder.fcmp_ordered(predicate, *args)
+
+        return MaskVector(a.count)(a, b), generate
 
     return operation
 
 
 at_least, at_most, above = _comparison(">="), _comparison("<="), _comparison(">")
+"""Lane by lane; false where a value is not a number."""
 
 
 def _extremum(predicate: str) -> Callable:
-    # (x < y) ? x : y is exactly the machine's min: it gives y where x is not a number.
+    # (a < b) ? a : b is exactly the machine's min: it gives b where a is not a number.
     @intrinsic
     def operation(typing, a, b):
         def generate(context, builder, signature, args):
@@ -167,6 +190,7 @@ def select(typing, mask, a, b):
 
 @intrinsic
 def both(typing, a, b):
+    """Where two masks are set."""
     return a(a, b), lambda context, builder, signature, args: builder.and_(*args)
 
 
@@ -180,99 +204,120 @@ def bits(typing, mask):
     return types.int64(mask), generate
 
 
-# -- making, loading and storing ------------------------------------------------------------------------------------
+# -- 2 ** x -----------------------------------------------------------------------------------------------------------
+
+_SQUARINGS = 3
+
+
+def _exp2_polynomial(degree: int) -> list[float]:
+    """2 ** x on [-1, 0], least relative squares on Chebyshev nodes, lowest power first."""
+    x = np.cos(np.pi * (np.arange(4000) + 0.5) / 4000) / 2 - 0.5
+    weighted = np.vander(x, degree + 1, increasing=True) / (2.0**x)[:, None]
+    solution = np.linalg.lstsq(weighted, np.ones_like(x), rcond=None)[0]
+    return [float(np.float32(value)) for value in solution]
+
+
+_EXP2 = _exp2_polynomial(5)
 
 
 @intrinsic
-def splat(typing, lanes, value):
+def exp2_8(typing, a):
+    """2 ** (8 a) for -1 <= a <= 0, to 2e-6 relative; anything for smaller a, even what is not a number.
+
+    A polynomial squared three times: over the range that blending needs this takes fewer operations than splitting off
+    an integer exponent.
+    """
+
+    def generate(context, builder, signature, args):
+        power = _constant(_EXP2[-1], a.count)
+        for coefficient in _EXP2[-2::-1]:
+            power = _fma(builder, power, args[0], _constant(coefficient, a.count))
+        for _ in range(_SQUARINGS):
+            power = builder.fmul(power, power)
+        return power
+
+    return a(a), generate
+
+
+# -- making, loading and storing --------------------------------------------------------------------------------------
+
+
+@intrinsic
+def zeros(typing, lanes):
+    """A vector as wide as `lanes`."""
+    kind = FloatVector(lanes.count)
+    return kind(lanes), lambda context, builder, signature, args: _constant(0.0, lanes.count)
+
+
+@intrinsic
+def splat(typing, value):
     """The same value, as float32, in every lane."""
-    count = lanes.count
 
     def generate(context, builder, signature, args):
-        scalar = context.cast(builder, args[1], value, types.float32)
-        undefined = ir.Constant(_floats(count), ir.Undefined)
+        scalar = context.cast(builder, args[0], value, types.float32)
+        undefined = ir.Constant(_floats(WIDTH), ir.Undefined)
         first = builder.insert_element(undefined, scalar, ir.Constant(_I32, 0))
-        return _shuffle(builder, first, undefined, [0] * count)
+        return _shuffle(builder, first, undefined, [0] * WIDTH)
 
-    return FloatVector(count)(lanes, value), generate
+    return FloatVector(WIDTH)(value), generate
 
 
 @intrinsic
-def load(typing, lanes, array, index):
+def load(typing, array, index):
     """Vector at flat element `index` of a C-contiguous float32 array; any alignment."""
-    count = lanes.count
 
     def generate(context, builder, signature, args):
-        value = builder.load(_pointer(context, builder, array, args[1], args[2], _floats(count)), typ=_floats(count))
-        value.align = 4
-        return value
+        return _read(builder, _pointer(context, builder, array, args[0], args[1], _floats(WIDTH)))
 
-    return FloatVector(count)(lanes, array, types.int64), generate
+    return FloatVector(WIDTH)(array, types.int64), generate
 
 
 @intrinsic
 def store(typing, array, index, vector):
+    """Inverse of `load`."""
+
     def generate(context, builder, signature, args):
-        to = _pointer(context, builder, array, args[0], args[1], _floats(vector.count))
-        builder.store(args[2], to).align = 4
+        _write(builder, args[2], _pointer(context, builder, array, args[0], args[1], _floats(vector.count)))
         return context.get_dummy_value()
 
     return types.void(array, types.int64, vector), generate
 
 
 @intrinsic
-def load_parts(typing, lanes, block, array, a, b):
-    """Vector of `lanes` from one or two pieces of `block` lanes, at flat elements a and b; b is idle if one fills it."""
-    count, width = lanes.count, block.count
+def load_block(typing, array, index, stride):
+    """A block of 4 x 4 pixels whose rows begin at index, index + stride, ..."""
 
     def generate(context, builder, signature, args):
-        parts = []
-        for at in args[3 : 3 + count // width]:
-            part = builder.load(_pointer(context, builder, array, args[2], at, _floats(width)), typ=_floats(width))
-            part.align = 4
-            parts.append(part)
-        return parts[0] if len(parts) == 1 else _shuffle(builder, parts[0], parts[1], list(range(count)))
+        rows, at = [], args[1]
+        for _ in range(4):
+            rows.append(_read(builder, _pointer(context, builder, array, args[0], at, _floats(4))))
+            at = builder.add(at, args[2])
+        upper, lower = [_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2)]
+        return _shuffle(builder, upper, lower, list(range(16)))
 
-    return FloatVector(count)(lanes, block, array, types.int64, types.int64), generate
+    return FloatVector(WIDTH)(array, types.int64, types.int64), generate
 
 
 @intrinsic
-def store_parts(typing, block, array, a, b, vector):
-    """Inverse of `load_parts`."""
-    width = block.count
+def store_block(typing, array, index, stride, vector):
+    """Inverse of `load_block`."""
 
     def generate(context, builder, signature, args):
-        for part, at in enumerate(args[2 : 2 + vector.count // width]):
-            value = _part(builder, args[4], part, width)
-            builder.store(value, _pointer(context, builder, array, args[1], at, _floats(width))).align = 4
+        at = args[1]
+        for row in range(4):
+            _write(builder, _part(builder, args[3], row, 4), _pointer(context, builder, array, args[0], at, _floats(4)))
+            at = builder.add(at, args[2])
         return context.get_dummy_value()
 
-    return types.void(block, array, types.int64, types.int64, vector), generate
+    return types.void(array, types.int64, types.int64, vector), generate
 
 
-def _part(builder: ir.IRBuilder, vector: ir.Value, part: int, width: int) -> ir.Value:
-    if vector.type.count == width:
-        return vector
-    return _shuffle(builder, vector, vector, list(range(part * width, (part + 1) * width)))
+# -- sums -------------------------------------------------------------------------------------------------------------
 
 
 @intrinsic
-def fold(typing, a, b, total):
-    """total + a * b, where a and b may hold twice the lanes of total: both halves are added to it."""
-
-    def generate(context, builder, signature, args):
-        sums = args[2]
-        for part in range(a.count // total.count):
-            factors = [_part(builder, args[k], part, total.count) for k in (0, 1)]
-            sums = _call(builder, f"llvm.fma.v{total.count}f32", sums.type, [*factors, sums])
-        return sums
-
-    return total(a, a, total), generate
-
-
-@intrinsic
-def fold_sum(typing, a, total):
-    """total + a, halves of a as in `fold`."""
+def fold(typing, a, total):
+    """total + a; where total has half the lanes of a, both halves are added."""
 
     def generate(context, builder, signature, args):
         sums = args[1]
@@ -284,43 +329,22 @@ def fold_sum(typing, a, total):
 
 
 @intrinsic
-def load_block(typing, lanes, array, index, stride):
-    """A block of 4 x (lanes / 4) pixels whose rows begin at index, index + stride, ..."""
-    count = lanes.count
+def fold_product(typing, a, b, total):
+    """total + a * b, halves as in `fold`."""
 
     def generate(context, builder, signature, args):
-        rows, at = [], args[2]
-        for _ in range(count // 4):
-            row = builder.load(_pointer(context, builder, array, args[1], at, _floats(4)), typ=_floats(4))
-            row.align = 4
-            rows.append(row)
-            at = builder.add(at, args[3])
-        while len(rows) > 1:
-            wide = list(range(2 * rows[0].type.count))
-            rows = [_shuffle(builder, a, b, wide) for a, b in zip(rows[::2], rows[1::2], strict=True)]
-        return rows[0]
+        sums = args[2]
+        for part in range(a.count // total.count):
+            first, second = [_part(builder, factor, part, total.count) for factor in args[:2]]
+            sums = _fma(builder, first, second, sums)
+        return sums
 
-    return FloatVector(count)(lanes, array, types.int64, types.int64), generate
-
-
-@intrinsic
-def store_block(typing, array, index, stride, vector):
-    """Inverse of `load_block`."""
-
-    def generate(context, builder, signature, args):
-        at = args[1]
-        for row in range(vector.count // 4):
-            part = _shuffle(builder, args[3], args[3], list(range(4 * row, 4 * row + 4)))
-            builder.store(part, _pointer(context, builder, array, args[0], at, _floats(4))).align = 4
-            at = builder.add(at, args[2])
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, types.int64, vector), generate
+    return total(a, a, total), generate
 
 
 @intrinsic
 def store_sums(typing, array, index, vectors):
-    """Write 16 floats: the sum over the lanes of each vector, in the tuple's order, then zeros.
+    """Write 16 floats: the sum over the lanes of each vector of a tuple, in its order, then zeros.
 
     A transposing tree: each level adds pairs of vectors, and keeps in every lane the half that belongs there.
     """
@@ -328,12 +352,12 @@ def store_sums(typing, array, index, vectors):
 
     def generate(context, builder, signature, args):
         given = [builder.extract_value(args[2], i) for i in range(len(vectors))]
-        for group in range(16 // count):
+        for group in range(WIDTH // count):
             members: list = given[group * count : (group + 1) * count]
             value = _transposed_sum(builder, members + [None] * (count - len(members)))
             at = builder.add(args[1], ir.Constant(_I64, group * count))
             to = _pointer(context, builder, array, args[0], at, _floats(count))
-            builder.store(_constant(0.0, count) if value is None else value, to).align = 4
+            _write(builder, _constant(0.0, count) if value is None else value, to)
         return context.get_dummy_value()
 
     return types.void(array, types.int64, vectors), generate
@@ -353,104 +377,27 @@ def _half_sum(builder: ir.IRBuilder, a: Any, b: Any, step: int, count: int) -> i
         return None
     other = _constant(0.0, count) if b is None else b
     lower = [(lane & ~step) + (count if lane & step else 0) for lane in range(count)]
-    return builder.fadd(
-        _shuffle(builder, a, other, lower), _shuffle(builder, a, other, [lane + step for lane in lower])
-    )
+    upper = [lane + step for lane in lower]
+    return builder.fadd(_shuffle(builder, a, other, lower), _shuffle(builder, a, other, upper))
 
 
-# -- 2 ** x ---------------------------------------------------------------------------------------------------------
-
-
-def _exp2_polynomial(degree: int) -> list[float]:
-    """2 ** x on [-0.5, 0.5], least relative squares on Chebyshev nodes, lowest power first."""
-    x = 0.5 * np.cos(np.pi * (np.arange(4000) + 0.5) / 4000)
-    weighted = np.vander(x, degree + 1, increasing=True) / (2.0**x)[:, None]
-    solution = np.linalg.lstsq(weighted, np.ones_like(x), rcond=None)[0]
-    return [float(np.float32(value)) for value in solution]
-
-
-_EXP2 = _exp2_polynomial(5)
-_ROUNDER = 12582912.0
-"""1.5 * 2 ** 23: adding it leaves the nearest integer in the lowest bits of the mantissa."""
-
-
-@intrinsic
-def exp2(typing, a):
-    """2 ** a for -126 <= a <= 126, to 3e-7 relative."""
-    count = a.count
-
-    def generate(context, builder, signature, args):
-        integers, rounder = ir.VectorType(_I32, count), _constant(_ROUNDER, count)
-        shifted = builder.fadd(args[0], rounder)
-        fraction = builder.fsub(args[0], builder.fsub(shifted, rounder))
-        power = _constant(_EXP2[-1], count)
-        for coefficient in _EXP2[-2::-1]:
-            terms = [power, fraction, _constant(coefficient, count)]
-            power = _call(builder, f"llvm.fma.v{count}f32", power.type, terms)
-        exponent = builder.shl(builder.bitcast(shifted, integers), ir.Constant(integers, [23] * count))
-        return builder.bitcast(builder.add(builder.bitcast(power, integers), exponent), power.type)
-
-    return a(a), generate
-
-
-def _poly(n):
-    # minimax-ish relative fit of 2**x on [-8/2^n... ]
-    lo = -8.1 / 2**n
-    k = np.arange(4000)
-    x = lo / 2 + lo / 2 * np.cos(np.pi * (k + 0.5) / 4000)
-    deg = {2: 6, 3: 5, 4: 4}[n]
-    w = np.vander(x, deg + 1, increasing=True) / (2.0**x)[:, None]
-    return [float(np.float32(v)) for v in np.linalg.lstsq(w, np.ones_like(x), rcond=None)[0]]
-
-
-def _sq(n, estrin):
-    C = _poly(n)
-
-    @intrinsic
-    def f(typing, a):
-        count = a.count
-
-        def generate(context, builder, signature, args):
-            x = args[0]
-            fm = lambda p, q, r: _call(builder, f"llvm.fma.v{count}f32", x.type, [p, q, r])
-            K = lambda v: _constant(v, count)
-            if estrin and n == 4:
-                x2 = builder.fmul(x, x)
-                p = fm(x2, fm(x2, K(C[4]), fm(x, K(C[3]), K(C[2]))), fm(x, K(C[1]), K(C[0])))
-            elif estrin and n == 3:
-                x2 = builder.fmul(x, x)
-                p = fm(x2, fm(x2, fm(x, K(C[5]), K(C[4])), fm(x, K(C[3]), K(C[2]))), fm(x, K(C[1]), K(C[0])))
-            else:
-                p = K(C[-1])
-                for c in C[-2::-1]:
-                    p = fm(p, x, K(c))
-            for _ in range(n):
-                p = builder.fmul(p, p)
-            return p
-
-        return a(a), generate
-
-    return f
-
-
-sq2, sq3, sq4, sq3e, sq4e = _sq(2, 0), _sq(3, 0), _sq(4, 0), _sq(3, 1), _sq(4, 1)
-
-
-# -- scalars --------------------------------------------------------------------------------------------------------
+# -- scalars and memory -----------------------------------------------------------------------------------------------
 
 
 @intrinsic
 def lowest_bit(typing, value):
-    """Position of the lowest set bit of an int64; 64 if there is none."""
+    """Position of the lowest set bit of a non-zero int64."""
 
     def generate(context, builder, signature, args):
-        return _call(builder, "llvm.cttz.i64", _I64, [args[0], ir.Constant(_I1, 0)])
+        return _call(builder, "llvm.cttz.i64", _I64, [args[0], ir.Constant(_I1, 1)])
 
     return types.int64(types.int64), generate
 
 
 @intrinsic
 def bit_count(typing, value):
+    """Number of set bits of an int64."""
+
     def generate(context, builder, signature, args):
         return _call(builder, "llvm.ctpop.i64", _I64, [args[0]])
 
@@ -459,9 +406,9 @@ def bit_count(typing, value):
 
 @intrinsic
 def align_stack(typing):
-    """Align the caller's stack frame to cache lines.
+    """Align the stack frame of the calling kernel to cache lines.
 
-    Without an aligned variable LLVM notices too late that vectors will be spilled, and lets them straddle cache lines.
+    Without an aligned variable LLVM finds out too late that vectors are spilled, and lets them straddle cache lines.
     """
 
     def generate(context, builder, signature, args):
@@ -474,7 +421,7 @@ def align_stack(typing):
     return types.void(), generate
 
 
-def _prefetch(write: int) -> Any:
+def _prefetch(write: int) -> Callable:
     @intrinsic
     def operation(typing, array, index):
         def generate(context, builder, signature, args):
