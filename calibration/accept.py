@@ -218,7 +218,7 @@ class MatchOptions:
     min_matches: int = 20
     """Pairs with fewer verified matches say nothing"""
     bad_share: float = 0.5
-    """A pair that explains less than this of its matches is bad"""
+    """A pair or a camera that explains less than this of its matches is bad"""
     min_explained: float = 0.8
     """Share of all matches that an acceptable calibration explains; measured 0.92 and more for right ones, 0.64 and
     less for wrong ones that registered every camera"""
@@ -243,7 +243,7 @@ class MatchesReport:
     bad_pairs: Mapping[str, float]
     """'a b' -> explained share"""
     bad_cameras: tuple[str, ...]
-    """Cameras most of whose pairs are bad, while most pairs of the others are good"""
+    """Cameras of whose matches less than `MatchOptions.bad_share` is explained, the worst set aside first"""
     reprojection_px: float | None
     """Median over the observations of triangulated points; None without points"""
     verdict: Verdict
@@ -274,7 +274,7 @@ def matches_report(
     verdict, reason = _verdict(explained, len(telling), len(rig.cameras), options)
     return MatchesReport(
         len(telling), len(every), explained, _median([float(np.median(error)) for error in errors]), bad,
-        _bad_cameras(telling, bad), _median(errors_px), verdict, reason,
+        _bad_cameras(telling, shares, options.bad_share), _median(errors_px), verdict, reason,
     )  # fmt: skip
 
 
@@ -303,23 +303,27 @@ def _verdict(explained: float | None, pairs: int, cameras: int, options: MatchOp
     return Verdict.ACCEPTED, f"the poses explain {explained:.0%} of the matches"
 
 
-def _bad_cameras(pairs: Sequence[PairMatches], bad: Mapping[str, float]) -> tuple[str, ...]:
-    """Peel off, one by one, the camera with the greatest share of bad pairs while that is more than half."""
-    left = [(pair.first, pair.second, pair.key in bad) for pair in pairs]
+def _bad_cameras(pairs: Sequence[PairMatches], shares: Sequence[float], bad_share: float) -> tuple[str, ...]:
+    """Peel off, one by one, the camera of whose matches the least share is explained, while that is a bad share.
+
+    Matches count, not pairs: pictures that share nothing may match by chance, but with few matches.
+    """
+    left = list(zip(pairs, shares, strict=True))
     found: list[str] = []
     while left:
-        names = sorted({name for first, second, _ in left for name in (first, second)})
-        shares = {name: _mean([is_bad for *ends, is_bad in left if name in ends]) for name in names}
-        worst = max(names, key=lambda name: shares[name])
-        if shares[worst] <= 0.5:
+        names = sorted({name for pair, _ in left for name in (pair.first, pair.second)})
+        explained = {name: _explained([e for e in left if name in (e[0].first, e[0].second)]) for name in names}
+        worst = min(names, key=lambda name: explained[name])
+        if explained[worst] >= bad_share:
             break
         found.append(worst)
-        left = [entry for entry in left if worst not in entry[:2]]
+        left = [entry for entry in left if worst not in (entry[0].first, entry[0].second)]
     return tuple(sorted(found))
 
 
-def _mean(values: Sequence[bool]) -> float:
-    return sum(values) / len(values)
+def _explained(entries: Sequence[tuple[PairMatches, float]]) -> float:
+    total = sum(len(pair.first_pixels) for pair, _ in entries)
+    return sum(share * len(pair.first_pixels) for pair, share in entries) / total
 
 
 def _pair_errors_px(rig: Rig, pair: PairMatches) -> np.ndarray:

@@ -72,7 +72,7 @@ class SolveOptions:
 def solve_rig(pictures: Mapping[str, np.ndarray | Sequence[np.ndarray]], options: SolveOptions, workspace: Path) -> Rig:
     """Place the cameras by their pictures, camera -> uint8 [H, W, 3] RGB, one or a list of synchronized instants.
 
-    A camera that most of its pairs contradict counts as not placed and is left out of the rig. Raises ValueError when
+    A camera that most of its matches contradict counts as not placed and is left out of the rig. Raises ValueError when
     fewer than two cameras are given, when too few can be placed, or when the placed cameras do not explain the matches;
     the message says which were placed and what to try. The workspace keeps COLMAP's files, its log, and report.json.
     The scale and the orientation of the world are arbitrary.

@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _end_gently_on_sigterm()
         return _load(arguments.function)(arguments)
     except BAD_INPUT as error:
-        return _say(WRONG, error)
+        return _say(WRONG, _system_message(error) if isinstance(error, OSError) else error)
     except KeyboardInterrupt:
         return _say(INTERRUPTED, "stopped; the same command goes on from here")
     except Terminated:
@@ -77,6 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # `packuv info SCENE | head` is no failure
         return OK
+    except OSError as error:  # a full disk, a lost network: the system's fault, and its message says all
+        return _say(FAILED, _system_message(error))
     except Exception as error:
         return _say(FAILED, f"{_first_sentence(error)}; the traceback is in {_write_log(error)}")
 
@@ -97,6 +99,12 @@ def _say(code: int, problem: object) -> int:
     """One line on stderr."""
     print(f"packuv: {' '.join(str(problem).split())}", file=sys.stderr)
     return code
+
+
+def _system_message(error: OSError) -> str:
+    """Without the number; with the file if there is one."""
+    what = error.strerror or re.sub(r"^\[Errno \d+\] ", "", str(error))
+    return f"{what}: {error.filename}" if error.filename else what
 
 
 def _first_sentence(error: Exception) -> str:

@@ -115,7 +115,9 @@ def _dome(count: int, options: RigOptions) -> np.ndarray:
     """A golden spiral on a flattened dome, from low and wide to high and close."""
     share = (np.arange(count) + 0.5) / count
     radius = np.maximum(options.radius_m * np.cos(0.25 * np.pi * share), NEAREST_M * share)
-    return _round(radius, GOLDEN_RAD * np.arange(count) + 0.3, 0.7 + (HIGHEST_M - 0.7) * share)
+    angle = (GOLDEN_RAD * np.arange(count) + 0.3) % (2 * np.pi)
+    # in the order of the angles, so that neighbours by name see much the same
+    return _round(radius, angle, 0.7 + (HIGHEST_M - 0.7) * share)[np.argsort(angle)]
 
 
 def _front(count: int, options: RigOptions) -> np.ndarray:

@@ -113,10 +113,10 @@ def test_photographs_of_a_fox_agree_with_their_calibration(data, tmp_path):
     folder = data / "fox"
     if not folder.is_dir():
         pytest.skip("no fox photographs among the recorded captures")
-    files = sorted((folder / "images").iterdir())[:10]
+    files = sorted((folder / "images").iterdir())[::3]
     pictures = {path.stem: cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_2)[..., ::-1].copy() for path in files}
     rig = solve_rig(pictures, replace(OPTIONS, features=FeatureOptions(max_features=2048), lens=Lens.OPENCV), tmp_path)
     centre, turn_deg = errors(rig, load_rig(folder / "transforms.json"))
-    assert len(rig.cameras) >= 9
+    assert len(rig.cameras) >= 16
     assert centre < 0.05  # measured 0.8 % in the median over 25 photographs, 4 % at worst
     assert turn_deg < 2

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -122,6 +123,17 @@ def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
     assert {label for label in found if not label.startswith("fit")} == {"encode", "verify", "evaluate"}
     assert redone(evaluate={"fitted_cameras": 2}) == {"evaluate"}
     assert redone() == set()  # back to what was there at first
+
+
+def test_a_full_disk_is_refused_before_the_work(first, capture, tmp_path, monkeypatch):
+    outcome, _ = first
+    usage = shutil.disk_usage(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
+        with pytest.raises(
+            OSError, match=r"needs about .* GB under .*store, but 0\.0 GB are free; choose another --out"
+        ):
+            run(request(capture, outcome.folder.parent))
 
 
 def test_an_earlier_stop_and_another_seed(first, capture):

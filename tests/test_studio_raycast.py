@@ -151,7 +151,7 @@ def test_a_mesh_of_a_sphere_is_hit_where_the_sphere_is() -> None:
     both = (mesh.item >= 0) & (solid.item >= 0)
     assert both.sum() > 0.97 * (solid.item >= 0).sum()
     # facets of 4.5 degrees lie up to 0.6 m * (1 - cos 2.25 deg) = 0.5 mm inside; grazing rays see more of it
-    assert np.quantile(np.abs(mesh.depth - solid.depth)[both], 0.95) < 2e-3
+    assert np.quantile(np.abs(mesh.depth[both] - solid.depth[both]), 0.95) < 2e-3
 
 
 def test_every_ray_meets_something_and_every_object_is_seen(scene, rig, backdrops, moments) -> None:
@@ -161,7 +161,8 @@ def test_every_ray_meets_something_and_every_object_is_seen(scene, rig, backdrop
         assert np.isfinite(hits.depth).all()
         assert hits.depth.min() > 0.2
         owners |= set(np.unique(hits.owner))
-    assert owners == set(range(len(OBJECTS)))
+    # this ring looks down, and the lamp hangs at the ceiling
+    assert owners == set(range(len(OBJECTS))) - {OBJECTS.index("lamp")}
 
 
 def test_depth_agrees_between_cameras(rig, backdrops, moments) -> None:
@@ -215,7 +216,8 @@ def test_warping_by_the_flow_explains_the_next_picture(scene, rig, backdrops, mo
     error, before = np.concatenate(moved).mean(), np.concatenate(stayed).mean()
     assert len(np.concatenate(moved)) > 3000
     # what remains is shading that turns with the surface and paint finer than a pixel
-    assert error < 0.4 * before
+    # (measured: 0.17)
+    assert error < 0.3 * before
 
 
 def eroded(owner: np.ndarray) -> np.ndarray:
@@ -235,6 +237,25 @@ def test_standing_points_have_no_flow_and_movers_move(scene, rig, backdrops, mom
     assert not motion.flow[~movers].any()
     assert motion.moves[movers].mean() > 0.95
     assert np.isfinite(motion.flow).all()
+
+
+def test_what_is_not_seen_again_is_hidden_or_outside(scene, rig, backdrops, moments) -> None:
+    hidden, nearer = 0, 0
+    for camera, backdrop in zip(rig, backdrops, strict=True):
+        now, later = (cast(camera.view, backdrop, moment.movers) for moment in moments)
+        motion = follow(camera.view, now, scene.standing, moments[0].movers, moments[1].movers)
+        target = points_of_pixels(camera.view) + motion.flow
+        inside = (target >= 0).all(-1) & (target < [WIDTH, HEIGHT]).all(-1)
+        assert not motion.seen[~inside].any()
+        # standing points keep their pixel, so the next picture's centre ray answers exactly
+        standing = now.item < 0
+        assert np.array_equal(motion.seen[standing], later.item[standing] < 0)
+        lost = inside & ~motion.seen & ~standing
+        column, row = target[lost].astype(int).T
+        hidden, nearer = hidden + lost.sum(), nearer + (later.depth[row, column] < now.depth[lost] + 0.02).sum()
+    assert hidden > 100
+    # at an outline the pixel's centre may look past what hides the point
+    assert nearer > 0.8 * hidden
 
 
 def test_nothing_moves_between_a_time_and_itself(scene, rig, backdrops, moments) -> None:
