@@ -220,8 +220,8 @@ class MatchOptions:
     bad_share: float = 0.5
     """A pair or a camera that explains less than this of its matches is bad"""
     min_explained: float = 0.8
-    """Share of all matches that an acceptable calibration explains; measured 0.92 and more for right ones, 0.64 and
-    less for wrong ones that registered every camera"""
+    """Share of all matches that an acceptable calibration explains. Measured: right ones 0.86 to 1.0; wrong ones that
+    placed every camera 0.2 to 0.75, and once 0.82, where chance matches had been let in"""
 
     def __post_init__(self) -> None:
         shares = 0 < self.bad_share < 1 and 0 < self.min_explained <= 1

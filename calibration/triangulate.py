@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.accept import MatchesReport, MatchOptions, PairMatches, check_rig, matches_report
+from calibration.accept import CheckOptions, MatchesReport, MatchOptions, PairMatches, check_rig, matches_report
 from calibration.features import Band, FeatureOptions, Features, detect, match
 from calibration.multiview import Sightings, essential, locate, medians
 from calibration.rig import Camera, Rig
@@ -25,6 +25,9 @@ _LINEAR = np.array(
     [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.arange(256) / 255], dtype=np.float32
 )
 """sRGB's electro-optical transfer function for 8-bit values: uint8 to linear light in [0, 1]"""
+
+_COARSE = CheckOptions(samples=21)
+"""Pairs need the scene's centre, not the exact extent of what the cameras share"""
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ def triangulate(
 
 def choose_pairs(rig: Rig, *, neighbours: int) -> list[tuple[str, str]]:
     """For each camera the `neighbours` that share most of its view under an angle that SIFT bears; by rig order."""
-    centre = np.array(check_rig(rig).scene_centre)
+    centre = np.array(check_rig(rig, options=_COARSE).scene_centre)
     shared = _shared_views(rig, centre)
     towards = rig.centres - centre
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
