@@ -6,7 +6,9 @@ while, moves as if it were optimized by itself.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numba import prange
@@ -92,24 +94,37 @@ def adam_step(
     prefer_tbb()
     rates = np.broadcast_to(np.asarray(rate, np.float32), (columns,))
     _step(parameters.reshape(count, columns), gradient.reshape(count, columns), state.first, state.second, state.steps,
-          np.ascontiguousarray(rates), np.ascontiguousarray(chosen).view(np.uint8), options.beta1, options.beta2,
-          _f32(options.epsilon))  # fmt: skip
+          np.ascontiguousarray(rates), np.ascontiguousarray(chosen).view(np.uint8),
+          _corrections(options.beta1, options.beta2), *map(_f32, (options.beta1, 1 - options.beta1, options.beta2,
+          1 - options.beta2, options.epsilon)))  # fmt: skip
+
+
+@cache
+def _corrections(beta1: float, beta2: float) -> np.ndarray:
+    """What moments that began at zero lack, by step: factors of the first and of the second's root, float32 [S, 2].
+
+    The last row is 1 within rounding, and serves for all later steps.
+    """
+    slowest = max(beta1, beta2, 0.5)
+    steps = np.arange(1, 2 + int(np.log(1e-8) / np.log(slowest)))
+    table = [np.ones(len(steps) + 1), np.ones(len(steps) + 1)]
+    table[0][1:], table[1][1:] = 1 / (1 - beta1**steps), 1 / np.sqrt(1 - beta2**steps)
+    return np.stack(table, axis=1).astype(np.float32)
 
 
 @kernel(parallel=True, fastmath=_FAST)
-def _step(parameters, gradient, first, second, steps, rates, rows, beta1, beta2, epsilon):
+def _step(parameters, gradient, first, second, steps, rates, rows, corrections, keep1, add1, keep2, add2, epsilon):
     count, columns = parameters.shape
-    keep1, keep2, add1, add2 = _f32(beta1), _f32(beta2), _f32(1 - beta1), _f32(1 - beta2)
     for chunk in prange(_CHUNKS):
         for i in range(count * chunk // _CHUNKS, count * (chunk + 1) // _CHUNKS):
             if rows[i] == 0:
                 continue
             steps[i] += 1
-            correct1 = _f32(1.0 / (1.0 - beta1 ** steps[i]))
-            correct2 = _f32(1.0 / np.sqrt(1.0 - beta2 ** steps[i]))
+            step = min(steps[i], corrections.shape[0] - 1)
             for k in range(columns):
                 g = gradient[i, k]
                 m = keep1 * first[i, k] + add1 * g
                 v = keep2 * second[i, k] + add2 * g * g
                 first[i, k], second[i, k] = m, v
-                parameters[i, k] -= rates[k] * correct1 * m / (np.sqrt(v) * correct2 + epsilon)
+                root = math.sqrt(v) * corrections[step, 1] + epsilon
+                parameters[i, k] -= rates[k] * corrections[step, 0] * m / root

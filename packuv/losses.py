@@ -14,7 +14,7 @@ from numba import prange
 from packuv.raster.cpu import prefer_tbb
 from packuv.raster.kernel import kernel
 from packuv.raster.project import TILE
-from packuv.raster.simd import ALL, WIDTH, above, fma, larger, load, select, splat, store, store_sums, zeros
+from packuv.raster.simd import ALL, WIDTH, above, fma, larger, load, select, splat, store, sum_lanes, zeros
 
 RADIUS = 5
 _WINDOW = 2 * RADIUS + 1
@@ -180,11 +180,11 @@ def _read_row(picture, target, active, base, x0, x1, memory, row, step):
 
 
 @kernel(inner=True)
-def _ssim_row(memory, blurred, mask, owned, derivatives, step, stride, sums):
+def _ssim_row(memory, blurred, mask, owned, derivatives, step, stride):
     """SSIM of one row under the mask, and its derivatives by the blurs of a, of a a + b b and of a b.
 
     `blurred` begins four rows of `stride`: a, b, a a + b b, a b; `derivatives` three rows of `step`. Returns the sum
-    where the row `owned` is 1. `sums` is scratch.
+    where the row `owned` is 1.
     """
     one, two, c1, c2, zero, total = splat(_1), splat(_2), splat(_C1), splat(_C2), zeros(ALL), zeros(ALL)
     for x in range(0, stride, WIDTH):
@@ -203,12 +203,11 @@ def _ssim_row(memory, blurred, mask, owned, derivatives, step, stride, sums):
         store(memory, derivatives + x, to_mean - two * a * to_square - b * to_product)
         store(memory, derivatives + step + x, to_square)
         store(memory, derivatives + 2 * step + x, to_product)
-    store_sums(sums, 0, (total,))
-    return sums[0]
+    return sum_lanes(total)
 
 
 @kernel(inner=True)
-def _gradient_row(memory, row, step, blurred, owned, stride, l1_scale, ssim_scale, sums):
+def _gradient_row(memory, row, step, blurred, owned, stride, l1_scale, ssim_scale):
     """Gradient of one row, in place of the first of its three `blurred` rows.
 
     Returns the absolute difference where the row `owned` is 1. `row` is the first of the rows read.
@@ -223,8 +222,7 @@ def _gradient_row(memory, row, step, blurred, owned, stride, l1_scale, ssim_scal
         d_square, d_product = load(memory, blurred + stride + x), load(memory, blurred + 2 * stride + x)
         ssim = fma(two * a, d_square, fma(b, d_product, load(memory, blurred + x)))
         store(memory, blurred + x, fma(scale * on, ssim, sign))
-    store_sums(sums, 0, (total,))
-    return sums[0]
+    return sum_lanes(total)
 
 
 @kernel(inner=True)
@@ -241,9 +239,9 @@ def _piece(picture, target, active, width, height, y0, y1, x0, x1, l1_scale, ssi
     owned = derivatives + 3 * step
     rings = owned + step
     blurred = rings + 7 * ring
-    memory, sums = np.zeros(blurred + 4 * stride, np.float32), np.empty(WIDTH, np.float32)
+    memory = np.zeros(blurred + 4 * stride, np.float32)
     memory[owned + RADIUS : owned + RADIUS + count] = _1
-    absolute = similarity = 0.0
+    absolute, similarity = np.float64(0), np.float64(0)
     for row in range(y0 - 2 * RADIUS, y1 + 2 * RADIUS):
         read = row % _WINDOW * 5 * step
         if 0 <= row < height:
@@ -260,7 +258,7 @@ def _piece(picture, target, active, width, height, y0, y1, x0, x1, l1_scale, ssi
         for k in range(4):
             _blur_column(memory, rings + k * ring, y, blurred + k * stride, stride)
         mask = (y % _WINDOW * 5 + 4) * step + RADIUS
-        total = _ssim_row(memory, blurred, mask, owned, derivatives, step, stride, sums)
+        total = _ssim_row(memory, blurred, mask, owned, derivatives, step, stride)
         similarity += total if y0 <= y < y1 else _0
         for k in range(3):
             _blur_row(memory, derivatives + k * step, rings + (4 + k) * ring + y % _WINDOW * stride, stride)
@@ -269,7 +267,7 @@ def _piece(picture, target, active, width, height, y0, y1, x0, x1, l1_scale, ssi
             for k in range(3):
                 _blur_column(memory, rings + (4 + k) * ring, y, blurred + k * stride, stride)
             read = y % _WINDOW * 5 * step + 2 * RADIUS
-            absolute += _gradient_row(memory, read, step, blurred, owned + RADIUS, stride, l1_scale, ssim_scale, sums)
+            absolute += _gradient_row(memory, read, step, blurred, owned + RADIUS, stride, l1_scale, ssim_scale)
             for x in range(count):
                 gradient[y * width + x0 + x] = memory[blurred + x]
     return absolute, similarity

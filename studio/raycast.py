@@ -624,7 +624,7 @@ def _shade(light, gloss, glow, paint, lamp, px, py, pz, nx, ny, nz, dx, dy, dz):
     return ar, ag, ab, (r + mirror) * key * power[0], (g + mirror) * key * power[1], (b + mirror) * key * power[2]
 
 
-@_inline
+@_kernel
 def _surface(shapes, item, second, third, px, py, pz, dx, dy, dz):
     """At a hit: unit normal facing the ray, u, v, and the cosine between ray and normal; d is a unit vector."""
     if item < len(shapes.kind):
@@ -639,7 +639,7 @@ def _surface(shapes, item, second, third, px, py, pz, dx, dy, dz):
     return nx, ny, nz, u, v, facing
 
 
-@_inline
+@_kernel
 def _appearance(view, shapes, light, colours, hit, px, py, pz, dx, dy, dz, lamp):
     """Normal, ambient and key radiance at a hit (t, item, weights)."""
     t, item, second, third = hit
@@ -664,7 +664,7 @@ def _look_once(view, standing, light, colours, samples, out):
                 _look_sample(view, standing, light, colours, samples, column, row, k, out, stack, entries)
 
 
-@_inline
+@_kernel
 def _look_centre(view, standing, column, row, out, stack, entries):
     # a store to an array of a tuple must not stand in the parallel loop itself: Numba drops it there as dead
     dx, dy, dz = _ray(view, column + 0.5, row + 0.5)
@@ -779,7 +779,7 @@ def _point(shapes, item, x, y, z):
     )
 
 
-@_inline
+@_kernel
 def _project(view, px, py, pz):
     """Picture point and depth of a world point; the picture point means nothing where the depth is not positive."""
     x, y, z = px - view.centre[0], py - view.centre[1], pz - view.centre[2]
@@ -790,7 +790,7 @@ def _project(view, px, py, pz):
     return u, v, depth
 
 
-@_inline
+@_kernel
 def _visible(view, shapes, px, py, pz, stack, entries):
     """Whether none of the shapes hides a world point from the camera."""
     o = view.centre

@@ -18,8 +18,8 @@ from studio.scene import VISITOR_FROM, VISITOR_TO, VISITOR_X
 
 TARGET = np.array([0.0, 0.0, 0.95])
 """What all cameras look at, world"""
-NEAREST_M, FARTHEST_M = 2.3, 3.4
-"""Closer, people would walk into the cameras; farther, cameras would stand in the furniture"""
+NEAREST_M, FARTHEST_M = 2.5, 3.4
+"""Closer, cameras would stand in the table; farther, cameras would stand in the furniture"""
 LOWEST_M, HIGHEST_M = 0.4, HEIGHT - 0.25
 HEAD_M, ARM_M = 2.05, 0.75
 """The visitor's way is free of cameras below this height, this far to each side"""
@@ -114,7 +114,7 @@ def _ring(count: int, options: RigOptions) -> np.ndarray:
 def _dome(count: int, options: RigOptions) -> np.ndarray:
     """A golden spiral on a flattened dome, from low and wide to high and close."""
     share = (np.arange(count) + 0.5) / count
-    radius = np.maximum(options.radius_m * np.cos(0.25 * np.pi * share), NEAREST_M * share)
+    radius = np.maximum(options.radius_m * np.cos(0.25 * np.pi * share), NEAREST_M)
     angle = (GOLDEN_RAD * np.arange(count) + 0.3) % (2 * np.pi)
     # in the order of the angles, so that neighbours by name see much the same
     return _round(radius, angle, 0.7 + (HIGHEST_M - 0.7) * share)[np.argsort(angle)]

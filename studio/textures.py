@@ -91,12 +91,12 @@ def _halvings(picture: np.ndarray) -> list[np.ndarray]:
     height, width = picture.shape[:2]
     if height & (height - 1) or width & (width - 1):
         raise ValueError(f"a texture's sides must be powers of two, but are {width}x{height}")
-    light: np.ndarray = linear_from_srgb(np.clip(picture, 0, 1)).astype(np.float32)
-    levels = [light]
+    levels = [np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)]
+    light = linear_from_srgb(np.arange(256) / 255).astype(np.float32)[levels[0]]
     while min(light.shape[:2]) > 1 and len(levels) < LEVELS:
         light = (light[::2, ::2] + light[1::2, ::2] + light[::2, 1::2] + light[1::2, 1::2]) / 4
-        levels.append(light)
-    return [np.rint(255 * srgb_from_linear(level)).astype(np.uint8) for level in levels]
+        levels.append(np.rint(255 * srgb_from_linear(light)).astype(np.uint8))
+    return levels
 
 
 # Building blocks
@@ -281,7 +281,7 @@ def _plaster_warm(rng: np.random.Generator) -> np.ndarray:
 
 def _wallpaper(rng: np.random.Generator) -> np.ndarray:
     """Damask: mirrored waves in two tones, on paper with fibres."""
-    shape, repeats = (1024, 1024), 6
+    shape, repeats = (512, 512), 6
     y, x = _grid(shape)
     u = np.abs((x * repeats + 0.5 * ((y * repeats / 1).astype(int) % 2)) % 1 - 0.5) * 2
     v = (y * repeats) % 1 + 0 * x
@@ -291,7 +291,7 @@ def _wallpaper(rng: np.random.Generator) -> np.ndarray:
         total += np.cos(np.pi * a * u) * np.cos(2 * np.pi * b * v + rng.uniform(0, 6.3)) / np.sqrt(a + b)
     motif = _step(np.abs(total), 0.55, 0.16) * (1 - 0.8 * _step(np.abs(total), 1.25, 0.16))
     paper = _mix((0.71, 0.68, 0.52), (0.45, 0.50, 0.36), motif)
-    fibre = _clouds(rng, shape, (200, 40), 3, 0.8)
+    fibre = _clouds(rng, shape, (128, 32), 3, 0.8)
     return paper * (1 + 0.08 * fibre + 0.06 * _clouds(rng, shape, (4, 4), 4))[..., None]
 
 
@@ -313,7 +313,7 @@ def _rug(rng: np.random.Generator) -> np.ndarray:
     """Woven rug: a medallion of mirrored waves in five wools, borders with small figures."""
     shape = (1024, 1024)
     y, x = _grid(shape)
-    u, v = np.abs(x - 0.5) * 2 + 0 * y, np.abs(y - 0.5) * 2 + 0 * x
+    u, v = np.abs(x - 0.5) * 2, np.abs(y - 0.5) * 2
     total = np.zeros(shape, np.float32)
     for _ in range(14):
         a, b = rng.integers(1, 12, 2)

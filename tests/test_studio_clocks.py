@@ -63,7 +63,8 @@ def test_timecode_files_read_back(tmp_path: Path) -> None:
     (tmp_path / "cam.txt").write_text("\n".join(timecode_lines(times)) + "\n")
     codes = read_timecodes(tmp_path / "cam.txt")
     assert np.array_equal(codes.times_ns, times.stamps_ns)
-    assert np.array_equal(codes.indices, times.first_index + np.arange(len(times.ticks)))
+    assert np.array_equal(codes.indices, np.arange(len(times.ticks)))
+    assert timecode_lines(times)[3].endswith(f"_{times.first_index + 3:012d}")
 
 
 @pytest.mark.parametrize("fps", [Fraction(30), Fraction(90)])

@@ -1,4 +1,4 @@
-"""Rays, truth per pixel and pictures: laws that the geometry must obey, checked without the ray caster's own kernels."""
+"""Rays, truth per pixel and pictures: laws of geometry, checked without the ray caster's own kernels."""
 
 from __future__ import annotations
 
@@ -70,7 +70,9 @@ def picture_of(scene: Scene, camera: StudioCamera, backdrop: Backdrop, moment: M
 
 
 def bare_textures() -> Textures:
-    return Textures(np.full((1, 3), 255, np.uint8), np.zeros((1, 12), np.int64), np.array([[1, 1, 1]], np.int32), {"x": 0})
+    return Textures(
+        np.full((1, 3), 255, np.uint8), np.zeros((1, 12), np.int64), np.array([[1, 1, 1]], np.int32), {"x": 0}
+    )
 
 
 def solids_alone(add) -> Hits:
@@ -163,6 +165,23 @@ def test_every_ray_meets_something_and_every_object_is_seen(scene, rig, backdrop
         owners |= set(np.unique(hits.owner))
     # this ring looks down, and the lamp hangs at the ceiling
     assert owners == set(range(len(OBJECTS))) - {OBJECTS.index("lamp")}
+
+
+def test_one_object_comes_late(scene: Scene) -> None:
+    """Before the door opens no camera sees the visitor; soon after, some do."""
+    views = [
+        camera.view
+        for kind in RigKind
+        for camera in place_cameras([f"cam{k}" for k in range(9)], 160, 90, 3, RigOptions(kind))
+    ]
+    backdrops = [look_once(view, scene.standing, scene.light, scene.colours, samples=1) for view in views]
+    counts = []
+    for seconds in (0.0, 0.15, ENTRANCE, ENTRANCE + 0.5, ENTRANCE + 2):
+        moment = scene.at(seconds)
+        owners = [cast(v, b, moment.movers).owner for v, b in zip(views, backdrops, strict=True)]
+        counts.append(sum((owner == OBJECTS.index("visitor")).sum() for owner in owners))
+    assert counts[:3] == [0, 0, 0]
+    assert 200 < counts[3] < counts[4]
 
 
 def test_depth_agrees_between_cameras(rig, backdrops, moments) -> None:
@@ -280,7 +299,7 @@ def test_motion_is_of_a_natural_size(scene, rig, backdrops, moments) -> None:
 
 
 def test_one_room_is_painted_for_all_cameras(scene, rig, backdrops, moments) -> None:
-    """Standing points seen by two cameras have the same colour in both: the shading is the world's, not the camera's."""
+    """Points seen by two cameras have the same colour in both: shading is the world's, not the camera's."""
     first, second = rig[1].view, rig[2].view
     depth = cast(first, backdrops[1], moments[0].movers).depth
     other = cast(second, backdrops[2], moments[0].movers)

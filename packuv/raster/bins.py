@@ -12,15 +12,36 @@ from packuv.raster.project import (
     INVERSE_VARIANCE_Y,
     INVERSE_XX,
     REACH,
+    RECORD,
     SHEAR,
     TILE,
     X,
     Y,
-)
-from packuv.raster.simd import ALL, at_least, at_most, bits, both, larger, load, prefetch, splat, square_root, zeros
+)  # fmt: skip
+from packuv.raster.simd import (
+    ALL,
+    at_least,
+    at_most,
+    bits,
+    both,
+    greatest_of_four,
+    larger,
+    least_of_four,
+    load,
+    prefetch,
+    select,
+    splat,
+    square_root,
+    zeros,
+)  # fmt: skip
 
 _f32 = np.float32
-_ROWS = (np.arange(TILE) + 0.5).astype(np.float32)
+_ROWS = np.array([4 * (lane % 4) + lane // 4 + 0.5 for lane in range(TILE)], np.float32)
+"""Rows of pixels of a tile, so ordered that lanes k, k + 4, k + 8, k + 12 hold the four of the k-th row of blocks"""
+_COLUMNS = np.array([4 * (lane % 4) + 0.5 for lane in range(TILE)], np.float32)
+"""Centre of the first pixel of each of a tile's blocks"""
+_FAR = np.float32(1e6)
+"""Beyond every picture"""
 _RADIX_BITS = 11
 _AHEAD = 8
 """Gaussians between asking for a cache line and using it."""
@@ -36,7 +57,7 @@ def drawn(cells, record, order, keys):
     for i in range(cells.shape[0]):
         if cells[i] > 0:
             order[count] = i
-            keys[count] = record[i * 16 + DEPTH]
+            keys[count] = record[i * RECORD + DEPTH]
             count += 1
     return count
 
@@ -78,38 +99,30 @@ def running_sum(counts, out):
     return total
 
 
-@kernel(inner=True)
-def _mask_row(record, g, tile_y, x0, x1, row_bits, active, tiles, masks, at):
-    """Append the tiles of one tile row that the outline of Gaussian g reaches; returns the end of the list.
+@kernel(inline=True)
+def _intervals(record, g, tile_y, height):
+    """From where to where the outline of Gaussian g reaches along x, in each of a tile row's four rows of blocks.
 
-    In each row of pixels the outline covers one interval, so the test of pixel centres against it is exact. Bit
-    4 j + i of a mask is the block in row j and column i of blocks.
+    Two vectors of pixels, lanes 4 j to 4 j + 3 for row j; the first is greater where nothing is reached. In each row
+    of pixels the outline covers one interval, so this is exact but for gaps in a needle's outline.
     """
-    r = g * 16
-    dy = load(_ROWS, 0) - splat(record[r + Y] - _f32(TILE * tile_y))
+    r = g * RECORD
+    row, far = load(_ROWS, 0), splat(_FAR)
+    dy = row - splat(record[r + Y] - _f32(TILE * tile_y))
     room = splat(record[r + REACH]) - dy * dy * splat(record[r + INVERSE_VARIANCE_Y])
     half = square_root(larger(room * splat(record[r + INVERSE_XX]), zeros(ALL)))
     centre = splat(record[r + X]) - splat(record[r + SHEAR]) * dy
-    low, high = centre - half, centre + half
-    row_bits &= bits(at_least(room, zeros(ALL)))
-    for tile_x in range(x0, x1 + 1):
-        if active[tile_y, tile_x] == 0:
-            continue
-        mask = np.int64(0)
-        for column in range(4):
-            first = _f32(TILE * tile_x + 4 * column) + _f32(0.5)
-            rows = bits(both(at_least(high, splat(first)), at_most(low, splat(first + _f32(3))))) & row_bits
-            rows |= rows >> 1
-            mask |= ((rows | (rows >> 2)) & 0x1111) << column
-        if mask != 0:
-            tiles[at], masks[at] = tile_y * active.shape[1] + tile_x, mask
-            at += 1
-    return at
+    reached = both(at_least(room, zeros(ALL)), at_most(row, splat(_f32(height - TILE * tile_y))))
+    first = least_of_four(select(reached, centre - half, far))
+    return first, greatest_of_four(select(reached, centre + half, zeros(ALL) - far))
 
 
 @kernel(parallel=True)
 def find_tiles(box, cells, first_cell, record, active, height, tiles, masks, hits):
-    """List the tiles of each Gaussian from its first cell on: tile number, block mask; `hits` [N] counts them."""
+    """List the tiles of each Gaussian from its first cell on: tile number, block mask; `hits` [N] counts them.
+
+    Bit 4 j + i of a mask is the block in row j and column i of a tile.
+    """
     count = cells.shape[0]
     for chunk in prange(CHUNKS):
         for g in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
@@ -118,9 +131,13 @@ def find_tiles(box, cells, first_cell, record, active, height, tiles, masks, hit
                 continue
             at = first_cell[g]
             for tile_y in range(box[g, 1], box[g, 3] + 1):
-                rows = min(TILE, height - TILE * tile_y)
-                at = _mask_row(record, np.int64(g), tile_y, box[g, 0], box[g, 2], (1 << rows) - 1, active,
-                               tiles, masks, at)  # fmt: skip
+                first, last = _intervals(record, np.int64(g), tile_y, height)
+                for tile_x in range(box[g, 0], box[g, 2] + 1):
+                    left = load(_COLUMNS, 0) + splat(_f32(TILE * tile_x))
+                    mask = bits(both(at_least(last, left), at_most(first, left + splat(_f32(3)))))
+                    if mask != 0 and active[tile_y, tile_x] != 0:
+                        tiles[at], masks[at] = tile_y * active.shape[1] + tile_x, mask
+                        at += 1
             hits[g] = at - first_cell[g]
 
 

@@ -55,6 +55,7 @@ from packuv.raster.simd import (
     store,
     store_block,
     store_sums,
+    sum_lanes,
     zeros,
 )  # fmt: skip
 
@@ -116,7 +117,7 @@ def _open_tile(state, columns, rows):
                 state[i] = _f32(0)
 
 
-@kernel(inner=True)
+@kernel(inline=True)
 def _add(state, at, weight, value):
     store(state, at, fma(weight, value, load(state, at)))
 
@@ -160,12 +161,12 @@ def _blend_tile(sums, record, pairs, begin, end, tile_x, tile_y, state, weights)
                 _add(state, at + _DEPTH, weight, depth)
                 total = fold(weight, total)
             if weights.size > 0:
-                store_sums(weights, slot * RECORD, (total,))
+                weights[slot] = sum_lanes(total)
         alive = _still_alive(state, alive)
     return i, visited
 
 
-@kernel(inner=True)
+@kernel(inline=True)
 def _write_vector(state, at, pixel, stride, plane, background, colour, depth, alpha):
     transmittance = load(state, at)
     for channel in range(3):
@@ -176,7 +177,7 @@ def _write_vector(state, at, pixel, stride, plane, background, colour, depth, al
     store_block(alpha, pixel, stride, splat(_f32(1)) - transmittance)
 
 
-@kernel(inner=True)
+@kernel(inline=True)
 def _write_pixel(state, at, pixel, plane, background, colour, depth, alpha):
     for channel in range(3):
         colour[pixel + plane * channel] = state[at + _RED + _PLANE * channel] + state[at] * background[channel]
@@ -204,10 +205,11 @@ def _write_tile(state, tile_x, tile_y, width, height, background, colour, depth,
 def _fill_tile(tile_x, tile_y, width, height, background, colour, depth, alpha):
     """Nothing but background."""
     for y in range(TILE * tile_y, min(TILE * tile_y + TILE, height)):
-        for pixel in range(y * width + TILE * tile_x, y * width + min(TILE * tile_x + TILE, width)):
-            for channel in range(3):
-                colour[pixel + width * height * channel] = background[channel]
-            depth[pixel] = alpha[pixel] = _f32(0)
+        begin, end = y * width + TILE * tile_x, y * width + min(TILE * tile_x + TILE, width)
+        for channel in range(3):
+            colour[begin + width * height * channel : end + width * height * channel] = background[channel]
+        depth[begin:end] = _f32(0)
+        alpha[begin:end] = _f32(0)
 
 
 @kernel(parallel=True)
@@ -216,7 +218,8 @@ def blend(sums, record, pairs, start, tiles_x, width, height, background, colour
     """Draw every tile whose list is not empty, background elsewhere.
 
     `record` and the pictures are flat; `used_end` [tiles] receives the end of the part of each list that was used,
-    `visited` [tiles] the number of blocks; `weights` is flat [pairs * 16], or empty when not wanted.
+    `visited` [tiles] the number of blocks; `weights` [pairs] receives the sum of transmittance * alpha
+    per slot; empty when not wanted.
     """
     count = start.shape[0] - 1
     for job in prange(jobs):
@@ -232,6 +235,18 @@ def blend(sums, record, pairs, start, tiles_x, width, height, background, colour
                 sums, record, pairs, start[tile], start[tile + 1], x, y, state, weights
             )
             _write_tile(state, x, y, width, height, background, colour, depth, alpha)
+            for i in range(used_end[tile], start[tile + 1] if weights.size > 0 else 0):
+                weights[pairs[i, SLOT]] = _f32(0)
+
+
+@kernel()
+def sum_weights(weights, first_pair, out):
+    """Blending weight per Gaussian, float32 [N], over its tiles in their order."""
+    for g in range(out.shape[0]):
+        total = _f32(0)
+        for slot in range(first_pair[g], first_pair[g + 1]):
+            total += weights[slot]
+        out[g] = total
 
 
 # -- gradients ------------------------------------------------------------------------------------------------------
@@ -293,7 +308,7 @@ def _gradient_tile(sums, record, pairs, begin, end, tile_x, tile_y, rows, state,
     return i
 
 
-@kernel(inner=True)
+@kernel(inline=True)
 def _start_vector(state, at, pixel, stride, plane, colour, depth, alpha, d_colour, d_depth, d_alpha):
     one = splat(_f32(1))
     g_depth = load_block(d_depth, pixel, stride)
@@ -309,7 +324,7 @@ def _start_vector(state, at, pixel, stride, plane, colour, depth, alpha, d_colou
     store(state, at, one)
 
 
-@kernel(inner=True)
+@kernel(inline=True)
 def _start_pixel(state, at, pixel, plane, colour, depth, alpha, d_colour, d_depth, d_alpha):
     rest = depth[pixel] * d_depth[pixel] - (_f32(1) - alpha[pixel]) * d_alpha[pixel]
     for channel in range(3):
@@ -342,7 +357,7 @@ def _start_tile(state, tile_x, tile_y, width, height, colour, depth, alpha, d_co
                     state[plane + to] = _f32(0)
 
 
-@kernel(inner=True)
+@kernel(inline=True)
 def _last_chosen(pairs, rows, begin, end):
     """End of the list after its last pair whose row is chosen: nothing behind it matters."""
     while end > begin and rows[pairs[end - 1, GAUSSIAN]] == 0:
@@ -365,17 +380,3 @@ def blend_backward(sums, record, pairs, start, used_end, tiles_x, width, height,
                 end = _gradient_tile(sums, record, pairs, begin, end, x, y, rows, state, partial)
             for i in range(begin, start[tile + 1]):
                 used[pairs[i, SLOT]] = i < end and rows[pairs[i, GAUSSIAN]] != 0
-
-
-@kernel(parallel=True)
-def gather_weights(weights, first_pair, start, used_end, pairs, used, out):
-    """Sum of transmittance * alpha per Gaussian, float32 [N], over its tiles in their order."""
-    for tile in prange(start.shape[0] - 1):
-        for i in range(start[tile], start[tile + 1]):
-            used[pairs[i, SLOT]] = i < used_end[tile]
-    for g in prange(out.shape[0]):
-        total = _f32(0)
-        for slot in range(first_pair[g], first_pair[g + 1]):
-            if used[slot] != 0:
-                total += weights[slot * RECORD]
-        out[g] = total

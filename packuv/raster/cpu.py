@@ -7,6 +7,7 @@ threads, nor on the run.
 from __future__ import annotations
 
 import ctypes
+import math
 import sys
 import weakref
 from collections.abc import Sequence
@@ -68,7 +69,7 @@ class Workspace:
         """An array, aligned to cache lines, whose content is undefined. O(number of free pieces)."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
-        memory = self._memory(int(np.prod(shape)) * kind.itemsize)
+        memory = self._memory(math.prod(shape) * kind.itemsize)
         lease = _Lease(memory, kind, shape)
         weakref.finalize(lease, self._free.append, memory).atexit = False
         return np.asarray(lease)
@@ -229,7 +230,7 @@ def backward(
     overflown = np.empty(CHUNKS, np.int64)
     project_backward(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits,
                      gaussians.sh, kept.sh_degree, kept.view, kept.record, chosen, kept.first_pair, used,
-                     partial.reshape(-1, RECORD), *out, overflown)  # fmt: skip
+                     partial, *out, overflown)  # fmt: skip
     return Gradients(out[0], out[1], out[2], out[3], out[4], out[5], int(overflown.sum()))
 
 
@@ -329,15 +330,12 @@ def _blend(kept: _Kept, camera: PinholeCamera, background: np.ndarray, weights: 
         take((height, width), np.float32),
         take((height, width), np.float32),
     )
-    pair_count = len(kept.pairs)
-    partial = take(pair_count * RECORD if weights else 0, np.float32)
+    partial = take(len(kept.pairs) if weights else 0, np.float32)
     blend.blend(kept.sums, kept.record.reshape(-1), kept.pairs, kept.start, tile_shape(camera)[1], width, height,
                 background, colour.reshape(-1), depth.reshape(-1), alpha.reshape(-1), kept.used_end, kept.visited,
                 partial, _jobs())  # fmt: skip
     if not weights:
         return colour, depth, alpha, None
-    sums = take(len(kept.gaussians), np.float32)
-    blend.gather_weights(
-        partial, kept.first_pair, kept.start, kept.used_end, kept.pairs, take(pair_count, np.uint8), sums
-    )
-    return colour, depth, alpha, sums
+    shares = take(len(kept.gaussians), np.float32)
+    blend.sum_weights(partial, kept.first_pair, shares)
+    return colour, depth, alpha, shares

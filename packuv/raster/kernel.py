@@ -17,19 +17,21 @@ _SOURCES = ("bins", "blend", "kernel", "project", "sh", "simd")
 
 
 def kernel(
-    *, parallel: bool = False, inner: bool = False, fastmath: frozenset[str] = frozenset()
+    *, parallel: bool = False, inner: bool = False, inline: bool = False, fastmath: frozenset[str] = frozenset()
 ) -> Callable[[Callable], Any]:
     """Compile a function with Numba, once per machine and version of these sources.
 
-    An `inner` kernel is called by kernels only: it gets no wrapper for Python, which would double its compile time.
+    An `inner` kernel is called by kernels only: it gets no wrapper for Python, which saves compile time. One to
+    `inline` is so small, or called so often, that passing seven arguments per array would cost more than its work.
 
     Numba's cache looks only at the file that holds a function, not at those it calls into: after an update it would
     run a mixture of old and new. So the cache lies in a folder named after the content of all sources.
     """
+    inner = inner or inline
+    options: dict[str, Any] = {"cache": not inner, "parallel": parallel, "forceinline": inline}
+    options |= {"error_model": "numpy", "nogil": True, "no_cpython_wrapper": inner, "no_cfunc_wrapper": inner}
 
     def decorate(function: Callable) -> Any:
-        options: dict[str, Any] = {"cache": not inner, "error_model": "numpy", "nogil": True, "parallel": parallel}
-        options |= {"no_cpython_wrapper": inner, "no_cfunc_wrapper": inner}
         with _cache_folder():
             return numba.njit(fastmath=set(fastmath), **options)(function)
 

@@ -15,6 +15,7 @@ from numba import prange
 from packuv.camera import PinholeCamera
 from packuv.raster import sh as harmonics
 from packuv.raster.kernel import kernel
+from packuv.raster.simd import ALL, load, store, zeros
 
 TILE = 16
 """Pixels along a side of a tile."""
@@ -41,6 +42,9 @@ _SLOPE_LIMITS, _NEAR, _LOW_PASS = 21, 25, 26
 
 EXPONENT_UNIT = 8.0
 _LOG2E = 1.4426950408889634
+_LOG_ALPHA_MIN = math.log(ALPHA_MIN)
+_LOGIT_MIN = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
+_REACH_MAX = -2 * _LOG_ALPHA_MIN
 _f32 = np.float32
 _FAST = frozenset({"contract", "nsz"})
 
@@ -57,7 +61,7 @@ def view_constants(camera: PinholeCamera, near: float, low_pass_px2: float) -> n
     ], dtype=np.float64)  # fmt: skip
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _in_camera(view, x, y, z):
     """A world point on the camera's axes."""
     return (
@@ -67,21 +71,21 @@ def _in_camera(view, x, y, z):
     )
 
 
-@kernel(inner=True, fastmath=_FAST)
-def _linear_map(view, x, y, z):
-    """Jacobian of the projection at a point on the camera's axes (4 entries that are not zero), and the same after the
-    camera's rotation, [2, 3] by rows."""
-    slope_x = min(max(x / z, view[_SLOPE_LIMITS]), view[_SLOPE_LIMITS + 1])
-    slope_y = min(max(y / z, view[_SLOPE_LIMITS + 2]), view[_SLOPE_LIMITS + 3])
-    a, c = view[_FX] / z, -view[_FX] * slope_x / z
-    b, d = view[_FY] / z, -view[_FY] * slope_y / z
+@kernel(inline=True, fastmath=_FAST)
+def _linear_map(view, u, v, inverse_z):
+    """Jacobian of the projection at slopes u = x / z and v = y / z (its four entries that are not zero), and the same
+    after the camera's rotation, [2, 3] by rows."""
+    u = min(max(u, view[_SLOPE_LIMITS]), view[_SLOPE_LIMITS + 1])
+    v = min(max(v, view[_SLOPE_LIMITS + 2]), view[_SLOPE_LIMITS + 3])
+    a, b = view[_FX] * inverse_z, view[_FY] * inverse_z
+    c, d = -a * u, -b * v
     return (a, c, b, d), (
         a * view[0] + c * view[6], a * view[1] + c * view[7], a * view[2] + c * view[8],
         b * view[3] + d * view[6], b * view[4] + d * view[7], b * view[5] + d * view[8],
     )  # fmt: skip
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _rotation(w, x, y, z):
     """Rotation matrix of a unit quaternion, by rows."""
     return (
@@ -91,7 +95,7 @@ def _rotation(w, x, y, z):
     )  # fmt: skip
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _screen_axes(u, r, s0, s1, s2):
     """The three axes of a Gaussian in the picture, pixels: M = U R S, [2, 3] by rows."""
     return (
@@ -104,7 +108,7 @@ def _screen_axes(u, r, s0, s1, s2):
     )
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _covariance(m, low_pass):
     """xx, xy, yy of M M^T plus the low-pass filter, pixels^2, and the determinant.
 
@@ -117,7 +121,7 @@ def _covariance(m, low_pass):
     return xx, xy, yy, n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (xx + yy) - low_pass * low_pass
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _is_valid(means, log_scales, quaternions, logits, i):
     length = max(abs(means[i, 0]), max(abs(means[i, 1]), abs(means[i, 2])))
     size = max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2]))
@@ -130,26 +134,24 @@ def _is_valid(means, log_scales, quaternions, logits, i):
     return math.isfinite(total + square) and length <= MAX_LENGTH and size <= MAX_LOG_SCALE and square > 1e-24
 
 
-@kernel(inner=True, fastmath=_FAST)
-def _outline_box(view, x, y, xx, yy, reach, box, i):
-    """Write the tiles [x0, y0, x1, y1], both ends included, that the outline's bounding box touches; False if none."""
-    half_x, half_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
-    x0, x1 = math.ceil(max(x - half_x - 0.5, 0.0)), math.floor(min(x + half_x - 0.5, view[_WIDTH] - 1))
-    y0, y1 = math.ceil(max(y - half_y - 0.5, 0.0)), math.floor(min(y + half_y - 0.5, view[_HEIGHT] - 1))
+@kernel(inline=True, fastmath=_FAST)
+def _touches(view, x, y, half_x, half_y, active_sum, box, i):
+    """Write the tiles [x0, y0, x1, y1], both ends included, that a box of pixels touches; False if none is active."""
+    # Clamped before they become integers, which far positions would overflow.
+    x0, x1 = max(x - half_x - 0.5, 0.0), min(x + half_x - 0.5, view[_WIDTH] - 1)
+    y0, y1 = max(y - half_y - 0.5, 0.0), min(y + half_y - 0.5, view[_HEIGHT] - 1)
     if not (x0 <= x1 and y0 <= y1):
         return False
-    box[i, 0], box[i, 1], box[i, 2], box[i, 3] = int(x0) >> 4, int(y0) >> 4, int(x1) >> 4, int(y1) >> 4
-    return True
+    left, top, right, bottom = math.ceil(x0), math.ceil(y0), int(x1), int(y1)
+    if left > right or top > bottom:
+        return False
+    c0, r0, c1, r1 = left >> 4, top >> 4, right >> 4, bottom >> 4
+    box[i, 0], box[i, 1], box[i, 2], box[i, 3] = c0, r0, c1, r1
+    inside = active_sum[r1 + 1, c1 + 1] - active_sum[r0, c1 + 1] - active_sum[r1 + 1, c0] + active_sum[r0, c0]
+    return inside > 0
 
 
-@kernel(inner=True, fastmath=_FAST)
-def _active_tiles(active_sum, box, i):
-    """Number of active tiles inside a box, from their summed-area table."""
-    x0, y0, x1, y1 = box[i, 0], box[i, 1], box[i, 2] + 1, box[i, 3] + 1
-    return active_sum[y1, x1] - active_sum[y0, x1] - active_sum[y1, x0] + active_sum[y0, x0]
-
-
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _direction(view, means, i):
     """Unit vector from the camera to a Gaussian, world, and one over the distance."""
     x, y, z = means[i, 0] - view[_CENTRE], means[i, 1] - view[_CENTRE + 1], means[i, 2] - view[_CENTRE + 2]
@@ -157,7 +159,7 @@ def _direction(view, means, i):
     return _f32(x * inverse), _f32(y * inverse), _f32(z * inverse), inverse
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _colour(view, means, sh, degree, values, record, i):
     """Write max(0, 0.5 + SH); False if it is not a usable number. `values` is scratch, float32 [16]."""
     x, y, z, _ = _direction(view, means, i)
@@ -171,40 +173,44 @@ def _colour(view, means, sh, degree, values, record, i):
     return abs(r) <= MAX_COLOUR and abs(g) <= MAX_COLOUR and abs(b) <= MAX_COLOUR
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
     """Fill the record (but for the colour) and the box of one valid Gaussian; False if it is not drawn."""
     x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
-    opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
-    if not (z >= view[_NEAR] and opacity >= ALPHA_MIN):
+    if not (z >= view[_NEAR] and logits[i] >= _LOGIT_MIN):
         return False
-    q0, q1, q2, q3 = _unit(quaternions, i)
-    _, u = _linear_map(view, x, y, z)
-    s0, s1, s2 = (
-        math.exp(np.float64(log_scales[i, 0])),
-        math.exp(np.float64(log_scales[i, 1])),
-        math.exp(np.float64(log_scales[i, 2])),
-    )
-    xx, xy, yy, determinant = _covariance(_screen_axes(u, _rotation(q0, q1, q2, q3), s0, s1, s2), view[_LOW_PASS])
-    reach = 2.0 * math.log(opacity * 255.0)
-    px, py = view[_FX] * x / z + view[_CX], view[_FY] * y / z + view[_CY]
-    if not _outline_box(view, px, py, xx, yy, reach, box, i) or _active_tiles(active_sum, box, i) == 0:
+    inverse_z = 1.0 / z
+    u, v = x * inverse_z, y * inverse_z
+    px, py = view[_FX] * u + view[_CX], view[_FY] * v + view[_CY]
+    (a, b, c, d), axes = _linear_map(view, u, v, inverse_z)
+    # A circle around the largest ellipse that these scales allow spares most Gaussians that are not drawn the rest.
+    size = math.exp(max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2])))
+    bound = math.sqrt(_REACH_MAX * ((a * a + b * b + c * c + d * d) * size * size + view[_LOW_PASS]))
+    if not _touches(view, px, py, bound, bound, active_sum, box, i):
+        return False
+    q0, q1, q2, q3, _ = _unit(quaternions, i)
+    s0, s1, s2 = math.exp(log_scales[i, 0]), math.exp(log_scales[i, 1]), math.exp(log_scales[i, 2])
+    xx, xy, yy, determinant = _covariance(_screen_axes(axes, _rotation(q0, q1, q2, q3), s0, s1, s2), view[_LOW_PASS])
+    log_opacity = -math.log1p(math.exp(-np.float64(logits[i])))
+    reach = max(2.0 * (log_opacity - _LOG_ALPHA_MIN), 0.0)
+    if not _touches(view, px, py, math.sqrt(reach * xx), math.sqrt(reach * yy), active_sum, box, i):
         return False
     record[i, X], record[i, Y], record[i, DEPTH] = px, py, z
     scale = _LOG2E / EXPONENT_UNIT / determinant
     record[i, XX], record[i, XY], record[i, YY] = -0.5 * scale * yy, scale * xy, -0.5 * scale * xx
-    record[i, LOG_OPACITY] = math.log2(opacity) / EXPONENT_UNIT
+    record[i, LOG_OPACITY] = log_opacity * _LOG2E / EXPONENT_UNIT
     record[i, SHEAR], record[i, INVERSE_VARIANCE_Y], record[i, REACH] = -xy / yy, 1.0 / yy, reach
     record[i, INVERSE_XX] = min(determinant / yy, 1e30)
     return True
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _unit(quaternions, i):
+    """The unit quaternion, and one over the length of the given one."""
     w, x, y, z = (np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]),
                   np.float64(quaternions[i, 3]))  # fmt: skip
     inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-    return w * inverse, x * inverse, y * inverse, z * inverse
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
 @kernel(parallel=True, fastmath=_FAST)
@@ -233,20 +239,20 @@ def project(means, log_scales, quaternions, logits, sh, degree, view, active_sum
 # -- gradients ------------------------------------------------------------------------------------------------------
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True)
 def _sum_pairs(partial, used, begin, end, out):
     """Sum the partial gradients of one Gaussian over its tiles, in their order; False if no tile drew it."""
-    out[:] = _f32(0)
+    total = zeros(ALL)
     hit = False
     for slot in range(begin, end):
         if used[slot] != 0:
             hit = True
-            for k in range(10):
-                out[k] += partial[slot, k]
+            total = total + load(partial, slot * RECORD)
+    store(out, 0, total)
     return hit
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i):
     """Write the gradient of the coefficients; return that of the position through the viewing direction."""
     x, y, z, inverse = _direction(view, means, i)
@@ -264,10 +270,9 @@ def _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh,
     return (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse
 
 
-@kernel(inner=True, fastmath=_FAST)
-def _axes_gradient(m, xx, xy, yy, determinant, g):
-    """Gradient of M [2, 3] by rows, from the moments of the exponent's gradient."""
-    a, b, c = yy / determinant, -xy / determinant, xx / determinant  # the inverse covariance
+@kernel(inline=True, fastmath=_FAST)
+def _axes_gradient(m, a, b, c, g):
+    """Gradient of M [2, 3] by rows, from the inverse covariance and the moments of the exponent's gradient."""
     ga, gb, gc = -0.5 * g[3], -0.5 * g[4], -0.5 * g[5]
     t00, t01, t10, t11 = a * ga + b * gb, a * gb + b * gc, b * ga + c * gb, b * gb + c * gc
     k00, k01, k11 = -(t00 * a + t01 * b), -(t00 * b + t01 * c), -(t10 * b + t11 * c)
@@ -277,7 +282,7 @@ def _axes_gradient(m, xx, xy, yy, determinant, g):
     )  # fmt: skip
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _quaternion_gradient(w, x, y, z, d, u):
     """Gradient of the unit quaternion, from d = dL/d(U R) [2, 3] and U [2, 3]."""
     r00, r01, r02 = u[0] * d[0] + u[3] * d[3], u[0] * d[1] + u[3] * d[4], u[0] * d[2] + u[3] * d[5]
@@ -291,7 +296,7 @@ def _quaternion_gradient(w, x, y, z, d, u):
     return gw - along * w, gx - along * x, gy - along * y, gz - along * z
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _map_gradient(view, d, r):
     """Gradient of the four entries of the projection's Jacobian, from d = dL/d(U R) and the rotation R."""
     e0, e1, e2 = (
@@ -310,19 +315,18 @@ def _map_gradient(view, d, r):
     )  # fmt: skip
 
 
-@kernel(inner=True, fastmath=_FAST)
-def _point_gradient(view, x, y, z, g, screen, jacobian, d_jacobian):
-    """Gradient of the position, world, from those of the picture's position, the depth and the Jacobian."""
-    u, v = x / z, y / z
-    px, py = screen[0] * view[_FX] / z, screen[1] * view[_FY] / z
-    pz = g[9] - px * u - py * v
+@kernel(inline=True, fastmath=_FAST)
+def _point_gradient(view, u, v, inverse_z, d_depth, screen, jacobian, d_jacobian):
+    """Gradient of the position, world, from those of the depth, the picture's position and the Jacobian."""
+    px, py = screen[0] * view[_FX] * inverse_z, screen[1] * view[_FY] * inverse_z
+    pz = d_depth - px * u - py * v
     a, c, b, d = jacobian
-    pz -= (d_jacobian[0] * a + d_jacobian[1] * c + d_jacobian[2] * b + d_jacobian[3] * d) / z
+    pz -= (d_jacobian[0] * a + d_jacobian[1] * c + d_jacobian[2] * b + d_jacobian[3] * d) * inverse_z
     if view[_SLOPE_LIMITS] < u < view[_SLOPE_LIMITS + 1]:
-        through = -view[_FX] / (z * z) * d_jacobian[1]
+        through = -a * inverse_z * d_jacobian[1]
         px, pz = px + through, pz - through * u
     if view[_SLOPE_LIMITS + 2] < v < view[_SLOPE_LIMITS + 3]:
-        through = -view[_FY] / (z * z) * d_jacobian[3]
+        through = -b * inverse_z * d_jacobian[3]
         py, pz = py + through, pz - through * v
     return (
         view[0] * px + view[3] * py + view[6] * pz,
@@ -331,40 +335,36 @@ def _point_gradient(view, x, y, z, g, screen, jacobian, d_jacobian):
     )
 
 
-@kernel(inner=True, fastmath=_FAST)
-def _project_one_backward(means, log_scales, quaternions, logits, view, g, d_log_scales, d_quaternions, d_logits,
-                          d_screen, i):  # fmt: skip
+@kernel(inline=True, fastmath=_FAST)
+def _project_one_backward(
+    means, log_scales, quaternions, logits, view, g, d_log_scales, d_quaternions, d_logits, d_screen, i
+):
     """Write every gradient of one Gaussian but those through its colour; return that of its position."""
     x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
-    jacobian, u = _linear_map(view, x, y, z)
-    q0, q1, q2, q3 = _unit(quaternions, i)
+    inverse_z = 1.0 / z
+    u, v = x * inverse_z, y * inverse_z
+    jacobian, axes = _linear_map(view, u, v, inverse_z)
+    q0, q1, q2, q3, inverse = _unit(quaternions, i)
     r = _rotation(q0, q1, q2, q3)
-    s0, s1, s2 = (
-        math.exp(np.float64(log_scales[i, 0])),
-        math.exp(np.float64(log_scales[i, 1])),
-        math.exp(np.float64(log_scales[i, 2])),
-    )
-    m = _screen_axes(u, r, s0, s1, s2)
+    s0, s1, s2 = math.exp(log_scales[i, 0]), math.exp(log_scales[i, 1]), math.exp(log_scales[i, 2])
+    m = _screen_axes(axes, r, s0, s1, s2)
     xx, xy, yy, determinant = _covariance(m, view[_LOW_PASS])
-    screen = (yy * g[1] - xy * g[2]) / determinant, (xx * g[2] - xy * g[1]) / determinant
+    scale = 1.0 / determinant
+    a, b, c = yy * scale, -xy * scale, xx * scale
+    screen = a * g[1] + b * g[2], b * g[1] + c * g[2]
     d_screen[i, 0], d_screen[i, 1] = screen[0], screen[1]
-    d = _axes_gradient(m, xx, xy, yy, determinant, g)
-    d_log_scales[i, 0] = d[0] * m[0] + d[3] * m[3]
-    d_log_scales[i, 1] = d[1] * m[1] + d[4] * m[4]
+    d = _axes_gradient(m, a, b, c, g)
+    d_log_scales[i, 0], d_log_scales[i, 1] = d[0] * m[0] + d[3] * m[3], d[1] * m[1] + d[4] * m[4]
     d_log_scales[i, 2] = d[2] * m[2] + d[5] * m[5]
     d = d[0] * s0, d[1] * s1, d[2] * s2, d[3] * s0, d[4] * s1, d[5] * s2
-    w = 0.0
-    for k in range(4):
-        w += np.float64(quaternions[i, k]) * quaternions[i, k]
-    inverse = 1.0 / math.sqrt(w)
-    h = _quaternion_gradient(q0, q1, q2, q3, d, u)
+    h = _quaternion_gradient(q0, q1, q2, q3, d, axes)
     d_quaternions[i, 0], d_quaternions[i, 1] = h[0] * inverse, h[1] * inverse
     d_quaternions[i, 2], d_quaternions[i, 3] = h[2] * inverse, h[3] * inverse
     d_logits[i] = g[0] / (1.0 + math.exp(np.float64(logits[i])))  # d alpha / d logit = alpha (1 - opacity)
-    return _point_gradient(view, x, y, z, g, screen, jacobian, _map_gradient(view, d, r))
+    return _point_gradient(view, u, v, inverse_z, g[9], screen, jacobian, _map_gradient(view, d, r))
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
     d_means[i, :] = _f32(0)
     d_log_scales[i, :] = _f32(0)
@@ -374,7 +374,7 @@ def _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
     d_sh[i, :, :] = _f32(0)
 
 
-@kernel(inner=True, fastmath=_FAST)
+@kernel(inline=True, fastmath=_FAST)
 def _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
     total = np.float64(d_logits[i]) + d_screen[i, 0] + d_screen[i, 1]
     for k in range(3):
@@ -385,7 +385,7 @@ def _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i
 @kernel(parallel=True, fastmath=_FAST)
 def project_backward(means, log_scales, quaternions, logits, sh, degree, view, record, rows, first_pair, used, partial,
                      d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, overflown):  # fmt: skip
-    """Reduce the partial gradients [pairs, 16] of every chosen Gaussian and carry them to its parameters.
+    """Reduce the partial gradients, flat [pairs * 16], of every chosen Gaussian and carry them to its parameters.
 
     Rows that are not chosen or not drawn are zero; so are rows whose gradient overflows, and those are counted in
     `overflown` [CHUNKS].

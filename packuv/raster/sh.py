@@ -17,7 +17,7 @@ _C3 = tuple(_f32(c) for c in (0.5900435899266435, 2.890611442640554, 0.457045799
 _2, _3, _4, _6, _8 = _f32(2), _f32(3), _f32(4), _f32(6), _f32(8)
 
 
-@kernel(inner=True)
+@kernel(inline=True)
 def basis(degree, x, y, z, out):
     """Write the (degree + 1) ** 2 basis values of the unit vector (x, y, z), float32, to `out` [16]."""
     out[0] = _C0
@@ -38,7 +38,7 @@ def basis(degree, x, y, z, out):
         out[15] = -_C3[0] * x * (xx - _3 * yy)
 
 
-@kernel(inner=True)
+@kernel(inline=True)
 def direction_gradient(degree, x, y, z, d):
     """Gradient with respect to (x, y, z), from that with respect to the basis values, `d` [16]."""
     gx, gy, gz = _f32(0), _f32(0), _f32(0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import llvmlite.binding
@@ -31,6 +32,7 @@ intrinsic: Any = extending.intrinsic
 _I1, _I8, _I32, _I64, _F32 = ir.IntType(1), ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType()
 
 
+@cache
 def register_lanes() -> Lanes:
     """The lanes that fill one register of this CPU: 16 with AVX-512, else 8.
 
@@ -146,6 +148,8 @@ def fma(typing, a, b, c):
 
 @intrinsic
 def square_root(typing, a):
+    """Lane by lane."""
+
     def generate(context, builder, signature, args):
         return _call(builder, f"llvm.sqrt.v{a.count}f32", args[0].type, list(args))
 
@@ -180,6 +184,25 @@ def _extremum(predicate: str) -> Callable:
 
 
 smaller, larger = _extremum("<"), _extremum(">")
+
+
+def _extremum_of_four(predicate: str) -> Callable:
+    @intrinsic
+    def operation(typing, a):
+        def generate(context, builder, signature, args):
+            best = _part(builder, args[0], 0, 4)
+            for k in range(1, 4):
+                part = _part(builder, args[0], k, 4)
+                best = builder.select(builder.fcmp_ordered(predicate, best, part), best, part)
+            return _shuffle(builder, best, best, [lane // 4 for lane in range(WIDTH)])
+
+        return a(a), generate
+
+    return operation
+
+
+least_of_four, greatest_of_four = _extremum_of_four("<"), _extremum_of_four(">")
+"""Lanes 4 k to 4 k + 3 of the result hold the least or greatest of lanes k, k + 4, k + 8 and k + 12."""
 
 
 @intrinsic
@@ -361,6 +384,17 @@ def store_sums(typing, array, index, vectors):
         return context.get_dummy_value()
 
     return types.void(array, types.int64, vectors), generate
+
+
+@intrinsic
+def sum_lanes(typing, vector):
+    """The sum of all lanes, float32."""
+
+    def generate(context, builder, signature, args):
+        total = _transposed_sum(builder, [args[0]] + [None] * (vector.count - 1))
+        return builder.extract_element(total, ir.Constant(_I32, 0))
+
+    return types.float32(vector), generate
 
 
 def _transposed_sum(builder: ir.IRBuilder, vectors: list) -> ir.Value | None:

@@ -1,0 +1,315 @@
+"""Speed of the CPU rasterizer, the photometric loss and Adam: where an iteration's time goes, and what the CPU can do.
+
+    python -m bench.raster --out runs/raster.json                          # a made-up room
+    python -m bench.raster --ply scene.ply --out runs/raster.json          # a trained scene
+
+Times are the least and the median of several repetitions, milliseconds. With one thread they are CPU time, which other
+processes disturb least; with more they are wall time. Compare rows of one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding
+import numba
+import numpy as np
+from numba import njit
+
+from packuv.adam import AdamState, adam_step
+from packuv.camera import PinholeCamera
+from packuv.interchange import read_ply
+from packuv.losses import PhotometricOptions, photometric_loss
+from packuv.quantize import Gaussians
+from packuv.raster import RasterOptions, Workspace, bins, blend, cpu, tile_shape
+from packuv.raster.cpu import Gradients, Rendering, backward, forward
+from packuv.raster.simd import fma, splat, sum_lanes
+
+STAGES = (
+    (cpu, "project"), (bins, "drawn"), (bins, "sort_by_depth"), (bins, "running_sum"), (bins, "find_tiles"),
+    (bins, "count_pairs"), (bins, "start_tiles"), (bins, "scatter_pairs"), (blend, "blend"), (blend, "blend_backward"),
+    (cpu, "project_backward"),
+)  # fmt: skip
+"""Kernels of a rendering and its gradients, in order"""
+FORWARD_FLOPS, BACKWARD_FLOPS = 34, 58
+"""Floating-point operations per pixel and Gaussian in the loops over blocks; fused ones count two, comparisons none"""
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What is measured."""
+
+    count: int = 60_000
+    """Gaussians of the made-up room"""
+    width: int = 640
+    height: int = 360
+    sh_degree: int = 3
+    """Of the made-up room"""
+    repeats: int = 15
+    """Repetitions of every measurement"""
+    shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.1, 0.05)
+    """Shares of active tiles, one rectangle each; the same share of rows may change"""
+    seed: int = 0
+
+
+# -- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def room(options: BenchOptions) -> Gaussians:
+    """Gaussians on the walls of a room two units across, three in ten inside, near ones near in memory."""
+    rng, count = np.random.default_rng(options.seed), options.count
+    means = rng.uniform(-1, 1, (count, 3))
+    axis, wall = rng.integers(0, 3, count), rng.random(count) < 0.7
+    means[wall, axis[wall]] = np.sign(means[wall, axis[wall]])
+    means[~wall] *= 0.5
+    cells = (((means + 1) * 8).astype(int) * (1, 16, 256)).sum(1)
+    order = np.argsort(cells, kind="stable")
+    coefficients = rng.normal(size=(count, (options.sh_degree + 1) ** 2, 3)) * 0.2
+    scales = np.log(0.012) + 0.6 * rng.normal(size=(count, 3))
+    logits = rng.normal(size=count) * 1.5 + 0.5
+    arrays = (means, scales, rng.normal(size=(count, 4)), logits, coefficients)
+    return Gaussians(*(np.ascontiguousarray(array[order], np.float32) for array in arrays))
+
+
+def room_camera(options: BenchOptions) -> PinholeCamera:
+    """Before one wall, looking at the opposite one."""
+    return _camera(np.array([0, 0, 0.95]), 0.625 * options.width, options)
+
+
+def trained_camera(gaussians: Gaussians, options: BenchOptions) -> PinholeCamera:
+    """Sees a trained scene (y down) whole, from its front."""
+    low, high = np.percentile(gaussians.means, [2, 98], axis=0)
+    return _camera(-(low + high) / 2 + (0, 0, 1.3 * float(np.max(high - low))), options.height, options)
+
+
+def _camera(translation: np.ndarray, focal: float, options: BenchOptions) -> PinholeCamera:
+    pose, width, height = np.eye(4), options.width, options.height
+    pose[:3, 3] = translation
+    return PinholeCamera("bench", width, height, focal, focal, width / 2, height / 2, pose)
+
+
+# -- measuring --------------------------------------------------------------------------------------------------------
+
+
+Clock = Callable[[], float]
+
+
+def timed(clock: Clock, samples: list[float], work: Callable, *arguments: Any, **options: Any) -> Any:
+    """Call something, and note how many milliseconds it took."""
+    start = clock()
+    result = work(*arguments, **options)
+    samples.append(1e3 * (clock() - start))
+    return result
+
+
+def summary(samples: Sequence[float]) -> dict[str, float]:
+    return {"min_ms": round(min(samples), 3), "median_ms": round(float(np.median(samples)), 3)}
+
+
+@contextmanager
+def stage_times(clock: Clock) -> Iterator[dict[str, list[float]]]:
+    """Times of every kernel that a rendering calls, by name."""
+    times: dict[str, list[float]] = {name: [] for _, name in STAGES}
+    kernels = [getattr(module, name) for module, name in STAGES]
+    for (module, name), kernel in zip(STAGES, kernels, strict=True):
+        setattr(module, name, partial(timed, clock, times[name], kernel))
+    try:
+        yield times
+    finally:
+        for (module, name), kernel in zip(STAGES, kernels, strict=True):
+            setattr(module, name, kernel)
+
+
+class Iteration:
+    """One camera's iteration of a fit, again and again."""
+
+    def __init__(self, gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions, clock: Clock) -> None:
+        rng = np.random.default_rng(options.seed)
+        self.gaussians, self.camera, self.clock = gaussians, camera, clock
+        self.target = rng.random((3, camera.height, camera.width)).astype(np.float32)
+        self.work = Workspace()
+        self.parameters = [getattr(gaussians, f.name).copy() for f in fields(Gaussians)]
+        self.states = [AdamState.zeros(array) for array in self.parameters]
+        self.times: dict[str, list[float]] = {name: [] for name in ("forward", "loss", "backward", "adam")}
+
+    def run(self, tiles: np.ndarray | None = None, rows: np.ndarray | None = None) -> Rendering:
+        """Render, compare, differentiate, step; the times go to `times`."""
+        clock, times, photometric = self.clock, self.times, PhotometricOptions()
+        drawn = timed(clock, times["forward"], forward, self.gaussians, self.camera, options=RasterOptions(near=0.05),
+                      workspace=self.work, tiles=tiles)  # fmt: skip
+        loss = timed(
+            clock, times["loss"], photometric_loss, drawn.colour, self.target, options=photometric, tiles=tiles
+        )
+        found = timed(clock, times["backward"], backward, drawn, loss.gradient, rows=rows)
+        visible = drawn.visible > 0
+        timed(clock, times["adam"], self._step, found, visible if rows is None else visible & rows)
+        return drawn
+
+    def _step(self, found: Gradients, rows: np.ndarray) -> None:
+        for field, values, state in zip(fields(Gaussians), self.parameters, self.states, strict=True):
+            adam_step(values, getattr(found, field.name), state, rate=1e-6, rows=rows)
+
+    def summary(self) -> dict[str, Any]:
+        return {name: summary(samples) for name, samples in self.times.items()}
+
+
+def measure_iteration(
+    gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions, threads: int
+) -> dict[str, Any]:
+    """An iteration at full picture, and its stages."""
+    numba.set_num_threads(threads)
+    clock = time.process_time if threads == 1 else time.perf_counter
+    iteration = Iteration(gaussians, camera, options, clock)
+    with stage_times(clock) as stages:
+        drawn = [iteration.run() for _ in range(options.repeats)][-1]
+    per_repeat = {name: np.reshape(samples, (options.repeats, -1)).sum(1).tolist() for name, samples in stages.items()}
+    return {
+        "threads": threads, "clock": clock.__name__, "visible": int((drawn.visible > 0).sum()),
+        "pairs": drawn.pair_count, "evaluations": drawn.evaluation_count, "iteration": iteration.summary(),
+        "stages": {name: summary(samples) for name, samples in per_repeat.items()},
+    }  # fmt: skip
+
+
+def measure_shares(gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions) -> list[dict[str, Any]]:
+    """Cost of an iteration against the share of active tiles, one thread."""
+    numba.set_num_threads(1)
+    rng, out = np.random.default_rng(options.seed), []
+    for share in options.shares:
+        tiles, rows = _rectangle(tile_shape(camera), share), rng.random(len(gaussians)) < share
+        iteration = Iteration(gaussians, camera, options, time.process_time)
+        drawn = [iteration.run(tiles, rows) for _ in range(options.repeats)][-1]
+        out.append({"tiles": float(tiles.mean()), "rows": float(rows.mean()), "evaluations": drawn.evaluation_count,
+                    **iteration.summary()})  # fmt: skip
+    return out
+
+
+def _rectangle(shape: tuple[int, int], share: float) -> np.ndarray:
+    """A centred rectangle of that share of all tiles."""
+    tiles = np.zeros(shape, bool)
+    height, width = (round(size * share**0.5) for size in shape)
+    top, left = (shape[0] - height) // 2, (shape[1] - width) // 2
+    tiles[top : top + height, left : left + width] = True
+    return tiles
+
+
+@njit(error_model="numpy")
+def _multiply_and_add(count, start):
+    a, b, c, d, e = splat(start), splat(2 * start), splat(3 * start), splat(4 * start), splat(5 * start)
+    x, y = splat(np.float32(0.999)), splat(start)
+    for _ in range(count):
+        a, b, c, d, e = fma(a, x, y), fma(b, x, y), fma(c, x, y), fma(d, x, y), fma(e, x, y)
+    return sum_lanes(a + b + c + d + e)
+
+
+def peak_gflops(repeats: int) -> float:
+    """What one thread reaches with independent fused multiply-adds and nothing else."""
+    count, samples = 1_000_000, list[float]()
+    _multiply_and_add(1, np.float32(0.5))
+    for _ in range(repeats):
+        timed(time.process_time, samples, _multiply_and_add, count, np.float32(0.5))
+    return count * 5 * 16 * 2 / min(samples) / 1e6
+
+
+SMALL = {"count": 100, "width": 64, "height": 48, "repeats": 1}
+FIRST_CALLS = f"""
+import time
+start = time.process_time()
+from bench.raster import BenchOptions, call_everything
+imported, wall = time.process_time() - start, time.perf_counter()
+call_everything(BenchOptions(**{SMALL!r}))
+print(imported, time.perf_counter() - wall, time.process_time() - start)
+"""
+
+
+def call_everything(options: BenchOptions) -> None:
+    Iteration(room(options), room_camera(options), options, time.process_time).run()
+
+
+def measure_compiler() -> dict[str, dict[str, float]]:
+    """Seconds until everything has run once in a new process, with an empty and with a full cache."""
+    out = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("cold", "warm"):
+            run = subprocess.run([sys.executable, "-c", FIRST_CALLS], env={**os.environ, "NUMBA_CACHE_DIR": folder},
+                                 capture_output=True, text=True, check=True)  # fmt: skip
+            names = ("import_cpu_seconds", "first_calls_wall_seconds", "cpu_seconds")
+            values = [round(float(word), 2) for word in run.stdout.split()]
+            out[name] = dict(zip(names, values, strict=True))
+    return out
+
+
+def throughput(measured: dict[str, Any], peak: float) -> dict[str, dict[str, float]]:
+    """Evaluations per second and core of both loops over blocks, and their share of the measured peak."""
+    out = {}
+    for name, flops in (("blend", FORWARD_FLOPS), ("blend_backward", BACKWARD_FLOPS)):
+        rate = measured["evaluations"] / measured["stages"][name]["min_ms"] / 1e6 / measured["threads"]
+        out[name] = {"evaluations_1e9_per_core_second": round(rate, 3), "share_of_peak": round(rate * flops / peak, 3)}
+    return out
+
+
+def run(options: BenchOptions, ply: Path | None = None) -> dict[str, Any]:
+    """All measurements."""
+    gaussians = read_ply(ply) if ply else room(options)
+    camera = trained_camera(gaussians, options) if ply else room_camera(options)
+    call_everything(BenchOptions(**SMALL))
+    peak = peak_gflops(options.repeats)
+    config: Any = numba.config
+    iterations = [measure_iteration(gaussians, camera, options, n) for n in sorted({1, config.NUMBA_NUM_THREADS})]
+    return {
+        "options": asdict(options), "scene": ply.name if ply else "room", "gaussians": len(gaussians),
+        "machine": {"cpu": llvmlite.binding.get_host_cpu_name(), "system": platform.platform(),
+                    "threading_layer": numba.threading_layer(), "load": os.getloadavg()[0]},
+        "peak_gflops_per_core": round(peak, 1), "iterations": iterations,
+        "throughput": [throughput(measured, peak) for measured in iterations],
+        "active_tiles": measure_shares(gaussians, camera, options), "compiler": measure_compiler(),
+    }  # fmt: skip
+
+
+def report(result: dict[str, Any]) -> Iterator[str]:
+    """Lines for people."""
+    yield f"{result['scene']}, {result['gaussians']:,} Gaussians, {result['machine']}"
+    yield f"peak {result['peak_gflops_per_core']} GFLOP/s a core"
+    for measured, rates in zip(result["iterations"], result["throughput"], strict=True):
+        yield f"{measured['threads']} threads ({measured['clock']}), {measured['pairs']:,} pairs; ms, least / median"
+        for name, value in {**measured["iteration"], **{f"  {k}": v for k, v in measured["stages"].items()}}.items():
+            yield f"  {name:20} {value['min_ms']:8.2f} {value['median_ms']:8.2f}"
+        for name, rate in rates.items():
+            speed, share = rate.values()
+            yield f"  {name}: {speed} G evaluations/s/core, {share:.0%} of peak"
+    columns = ("forward", "loss", "backward", "adam")
+    yield f"active tiles: {', '.join(columns)} (ms, least)"
+    for row in result["active_tiles"]:
+        yield f"  {row['tiles']:6.1%} " + " ".join(f"{row[name]['min_ms']:8.2f}" for name in columns)
+    yield f"first calls: cold {result['compiler']['cold']}, warm {result['compiler']['warm']}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--ply", type=Path, help="a trained scene instead of the made-up room")
+    parser.add_argument("--size", default="640x360", help="of the picture, WxH")
+    parser.add_argument("--count", type=int, default=BenchOptions.count, help="Gaussians of the made-up room")
+    parser.add_argument("--repeats", type=int, default=BenchOptions.repeats)
+    given = parser.parse_args(arguments)
+    width, height = map(int, given.size.split("x"))
+    result = run(BenchOptions(count=given.count, width=width, height=height, repeats=given.repeats), given.ply)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    given.out.write_text(json.dumps(result, indent=1) + "\n")
+    print("\n".join(report(result)))
+
+
+if __name__ == "__main__":
+    main()
