@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.accept import CheckOptions, Verdict, check_rig
+from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
 from calibration.colour import BalanceOptions, balance, with_gains
 from calibration.importers import load_rig
 from calibration.judge import judge
@@ -37,8 +37,9 @@ class RigOptions:
     """How cameras are found and judged."""
 
     check: CheckOptions = field(default_factory=CheckOptions)
-    judge: TriangulateOptions = field(default_factory=TriangulateOptions)
-    """Matches by which a calibration that is given is judged"""
+    judge: TriangulateOptions = field(default_factory=lambda: TriangulateOptions(judge=MatchOptions(min_explained=0.5)))
+    """Matches by which a calibration that is given is judged. Milder than a solve's: a given calibration that is wrong
+    explains a few percent, while few cameras far apart before patterned walls let chance matches in (78 % in the demo)"""
     trust: bool = False
     """Use a given calibration although the pictures contradict it"""
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
