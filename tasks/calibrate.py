@@ -39,7 +39,7 @@ class RigOptions:
     check: CheckOptions = field(default_factory=CheckOptions)
     judge: TriangulateOptions = field(default_factory=lambda: TriangulateOptions(judge=MatchOptions(min_explained=0.5)))
     """Matches by which a calibration that is given is judged. Milder than a solve's: a given calibration that is wrong
-    explains a few percent, while few cameras far apart before patterned walls let chance matches in (78 % in the demo)"""
+    explains a few percent, while few cameras before patterned walls let chance matches in (78 % in the demo)"""
     trust: bool = False
     """Use a given calibration although the pictures contradict it"""
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
