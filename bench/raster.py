@@ -32,7 +32,7 @@ from numba import njit
 from packuv.adam import AdamState, adam_step
 from packuv.camera import PinholeCamera
 from packuv.interchange import read_ply
-from packuv.losses import PhotometricOptions, photometric_loss
+from packuv.losses import photometric_loss
 from packuv.quantize import Gaussians
 from packuv.raster import RasterOptions, Workspace, bins, blend, cpu, tile_shape
 from packuv.raster.cpu import Gradients, Rendering, backward, forward
@@ -147,7 +147,7 @@ class Iteration:
 
     def run(self, tiles: np.ndarray | None = None, rows: np.ndarray | None = None) -> Rendering:
         """Render, compare, differentiate, step; the times go to `times`."""
-        clock, times, photometric = self.clock, self.times, PhotometricOptions()
+        clock, times, target = self.clock, self.times, self.target
         drawn = timed(clock, times["forward"], forward, self.gaussians, self.camera, options=RasterOptions(near=0.05),
                       workspace=self.work, tiles=tiles)  # fmt: skip
         loss = timed(
@@ -223,18 +223,19 @@ def peak_gflops(repeats: int) -> float:
     return count * 5 * 16 * 2 / min(samples) / 1e6
 
 
-SMALL = {"count": 100, "width": 64, "height": 48, "repeats": 1}
-FIRST_CALLS = f"""
+FIRST_CALLS = """
 import time
 start = time.process_time()
-from bench.raster import BenchOptions, call_everything
+from bench.raster import call_everything
 imported, wall = time.process_time() - start, time.perf_counter()
-call_everything(BenchOptions(**{SMALL!r}))
+call_everything()
 print(imported, time.perf_counter() - wall, time.process_time() - start)
 """
 
 
-def call_everything(options: BenchOptions) -> None:
+def call_everything() -> None:
+    """One small iteration: everything gets compiled."""
+    options = BenchOptions(count=100, width=64, height=48)
     Iteration(room(options), room_camera(options), options, time.process_time).run()
 
 
@@ -264,7 +265,7 @@ def run(options: BenchOptions, ply: Path | None = None) -> dict[str, Any]:
     """All measurements."""
     gaussians = read_ply(ply) if ply else room(options)
     camera = trained_camera(gaussians, options) if ply else room_camera(options)
-    call_everything(BenchOptions(**SMALL))
+    call_everything()
     peak = peak_gflops(options.repeats)
     config: Any = numba.config
     iterations = [measure_iteration(gaussians, camera, options, n) for n in sorted({1, config.NUMBA_NUM_THREADS})]
