@@ -10,7 +10,7 @@ READY := .venv/.ready
 
 demo: $(READY)
 	$(BIN)/packuv simulate runs/demo/capture --cameras 8 --frames 24 --size 320x180 --seed 7
-	$(BIN)/packuv run runs/demo/capture --out runs/demo --preset draft
+	$(BIN)/packuv run runs/demo/capture --out runs/demo --preset draft --set fit.iterations=1200 --set fit.density.cap=30000
 
 test: $(READY)
 	$(BIN)/python -m pytest

@@ -32,7 +32,7 @@ from numba import njit
 from packuv.adam import AdamState, adam_step
 from packuv.camera import PinholeCamera
 from packuv.interchange import read_ply
-from packuv.losses import photometric_loss
+from packuv.losses import PhotometricOptions, photometric_loss
 from packuv.quantize import Gaussians
 from packuv.raster import RasterOptions, Workspace, bins, blend, cpu, tile_shape
 from packuv.raster.cpu import Gradients, Rendering, backward, forward
@@ -151,7 +151,7 @@ class Iteration:
         drawn = timed(clock, times["forward"], forward, self.gaussians, self.camera, options=RasterOptions(near=0.05),
                       workspace=self.work, tiles=tiles)  # fmt: skip
         loss = timed(
-            clock, times["loss"], photometric_loss, drawn.colour, self.target, options=photometric, tiles=tiles
+            clock, times["loss"], photometric_loss, drawn.colour, target, options=PhotometricOptions(), tiles=tiles
         )
         found = timed(clock, times["backward"], backward, drawn, loss.gradient, rows=rows)
         visible = drawn.visible > 0
