@@ -174,7 +174,8 @@ def measure_iteration(
     clock = time.process_time if threads == 1 else time.perf_counter
     iteration = Iteration(gaussians, camera, options, clock)
     with stage_times(clock) as stages:
-        drawn = [iteration.run() for _ in range(options.repeats)][-1]
+        for _ in range(options.repeats):
+            drawn = iteration.run()
     per_repeat = {name: np.reshape(samples, (options.repeats, -1)).sum(1).tolist() for name, samples in stages.items()}
     return {
         "threads": threads, "clock": clock.__name__, "visible": int((drawn.visible > 0).sum()),
@@ -190,7 +191,8 @@ def measure_shares(gaussians: Gaussians, camera: PinholeCamera, options: BenchOp
     for share in options.shares:
         tiles, rows = _rectangle(tile_shape(camera), share), rng.random(len(gaussians)) < share
         iteration = Iteration(gaussians, camera, options, time.process_time)
-        drawn = [iteration.run(tiles, rows) for _ in range(options.repeats)][-1]
+        for _ in range(options.repeats):
+            drawn = iteration.run(tiles, rows)
         out.append({"tiles": float(tiles.mean()), "rows": float(rows.mean()), "evaluations": drawn.evaluation_count,
                     **iteration.summary()})  # fmt: skip
     return out

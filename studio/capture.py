@@ -142,7 +142,7 @@ def simulate(folder: Path, options: SimulateOptions | None = None, progress: Pro
 
     Args:
         folder: must not exist, or be empty.
-        progress: called with pictures done and in all, after each picture.
+        progress: called with pictures done and in all, at the start and after each picture.
 
     Raises:
         ValueError: the folder has something in it, or the options contradict each other.
@@ -189,22 +189,24 @@ def _write(folder: Path, times: tuple[CameraTimes, ...], options: SimulateOption
     recordings = [Recording(*parts) for parts in zip(rig, times, gains, strict=True)]
     truth = truth_json(_plain(options), options.fps, tick_times(options.frames, options.fps), entrance_ns, recordings)
     (folder / "truth" / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
-    _film_all(folder, build_scene(options.seed, entrance_s), recordings, options, progress)
+    _film_all(folder, entrance_s, recordings, options, progress)
 
 
 def _film_all(
     folder: Path,
-    scene: Scene,
+    entrance_s: float,
     recordings: Sequence[Recording],
     options: SimulateOptions,
     progress: Progress | None,
 ) -> None:
+    report = progress or (lambda done, total: None)
     done, total = 0, sum(len(recording.times.ticks) for recording in recordings)
+    report(done, total)
+    scene = build_scene(options.seed, entrance_s)
     for recording in recordings:
         for _ in _film(folder, scene, recording, options):
             done += 1
-            if progress is not None:
-                progress(done, total)
+            report(done, total)
 
 
 def _film(folder: Path, scene: Scene, recording: Recording, options: SimulateOptions) -> Iterator[None]:
