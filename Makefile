@@ -9,7 +9,7 @@ READY := .venv/.ready
 .PHONY: demo test test-fast check setup clean
 
 demo: $(READY)
-	$(BIN)/packuv simulate runs/demo/capture --cameras 8 --frames 24 --size 320x180 --seed 7
+	$(BIN)/packuv simulate runs/demo/capture --cameras 8 --frames 24 --size 320x180 --seed 7 --rig front
 	$(BIN)/packuv run runs/demo/capture --out runs/demo --preset draft --set fit.iterations=1200 --set fit.density.cap=30000
 
 test: $(READY)
