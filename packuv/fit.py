@@ -21,26 +21,27 @@ import numpy as np
 from packuv.density import opacity
 from packuv.files import write_json, write_npz
 from packuv.frames import Views
-from packuv.freespace import sweep_free_space
 from packuv.labels import active_tiles, dynamic_labels
 from packuv.lift import lift_motion
 from packuv.model import ATTRIBUTES, Model, canonical, rows_of
 from packuv.motion import MotionCache
 from packuv.quantize import OPACITY, OPACITY_RANGE, Codes, Gaussians, Quantizer, attribute_values
 from packuv.segment import Segment
+from packuv.shell import sweep_shell
 from packuv.solver import FitOptions, Progress, Shot, Solver, Ticks, halved
 from packuv.start import (
     Bounds,
     Points,
-    Sights,
+    drawn,
     find_bounds,
     first_gaussians,
     hull_points,
     neighbour_distance,
+    no_points,
     round_gaussians,
 )
 
-VERSION = 1
+VERSION = 2
 """Raised with every change that alters what a fit returns"""
 
 DEAD_CODE = 1
@@ -80,26 +81,21 @@ def fit_first(
     instant: int,
     *,
     points: Points | None,
-    sights: Sights | None = None,
     options: FitOptions,
     progress: Progress | None = None,
 ) -> KeyState:
-    """Fit the first keyframe from sparse points and random Gaussians, none of them in air that `sights` cross.
+    """Fit the first keyframe from sparse points, the shell around the scene and random Gaussians.
 
     `views` must hold the cameras to fit and no others. Raises ValueError if fewer than two have a picture.
     """
     started = time.monotonic()
     shots = _shots(views, instant)
     bounds = find_bounds(views.cameras, near_share=options.near_share)
-    air = None
-    if sights is not None:
-        air = sweep_free_space(sights.origins, sights.ends, bounds=bounds, options=options.free_space)
-    start = first_gaussians([s.camera for s in shots], [s.target for s in shots], bounds=bounds, points=points,
-                            empty=air.contains if air else None, options=options.start,
-                            sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
+    surface = _surface(shots, points, bounds, options)
+    start = first_gaussians([s.camera for s in shots], [s.target for s in shots], bounds=bounds, surface=surface,
+                            options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
     model = Model(start)
     solver = Solver(model, bounds, options, np.random.default_rng([options.seed, instant, 0]))
-    solver.free_space = air
     ticks = Ticks(progress, options.iterations)
     coarse = round(options.iterations * options.coarse_share)
     floating = max(coarse, round(options.iterations * options.float_share))
@@ -205,6 +201,21 @@ def _fit_frame(
     figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count, "loss": loss,
                "dynamic": int(changed.sum()), "tiles": tiles}  # fmt: skip
     return changed, figures
+
+
+def _surface(shots: Sequence[Shot], points: Points | None, bounds: Bounds, options: FitOptions) -> Points:
+    """Where surfaces are: sparse points, sure places of the shell, and the rest of the shell evenly."""
+    start, rng = options.start, np.random.default_rng([options.seed, 3])
+    room = round(start.count * start.surface_share)
+    parts = [] if points is None else [drawn(points, room, rng)]
+    shell = None
+    if options.shell.enabled:
+        shell = sweep_shell([s.camera for s in shots], [s.target for s in shots], bounds=bounds, options=options.shell)
+    if shell is not None:
+        parts.append(shell.sure_points(room - sum(len(part.xyz) for part in parts), rng))
+        parts.append(shell.cover(round(start.count * start.shell_share)))
+    parts = parts or [no_points()]
+    return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
 
 
 def choose_quantizer(gaussians: Gaussians, bounds: Bounds, sh_degree: int) -> Quantizer:

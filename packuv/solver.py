@@ -10,13 +10,13 @@ import numpy as np
 
 from packuv.camera import PinholeCamera
 from packuv.density import DensityOptions, ScreenGradient, grow, opacity, prune, relocate
-from packuv.freespace import FreeSpace, FreeSpaceOptions
 from packuv.labels import LabelOptions
 from packuv.lift import LiftOptions
 from packuv.losses import PhotometricOptions, photometric_loss
 from packuv.model import ATTRIBUTES, Model, Rates, rows_of
 from packuv.quantize import Gaussians, Quantizer
 from packuv.raster import RasterOptions, Workspace, gradients, render
+from packuv.shell import ShellOptions
 from packuv.start import Bounds, StartOptions
 from packuv.uvmap import UvOptions
 
@@ -75,7 +75,7 @@ class FitOptions:
     settle: float = 0.003
     """A frame stops when a pass over the cameras improves the loss by less than this share"""
     seed: int = 0
-    free_space: FreeSpaceOptions = field(default_factory=FreeSpaceOptions)
+    shell: ShellOptions = field(default_factory=ShellOptions)
     start: StartOptions = field(default_factory=StartOptions)
     density: DensityOptions = field(default_factory=DensityOptions)
     rates: Rates = field(default_factory=Rates)
@@ -116,8 +116,6 @@ class Solver:
         self.model = model
         self.rows = np.ones(len(model), bool)
         """Which Gaussians may change"""
-        self.free_space: FreeSpace | None = None
-        """Air that must stay empty"""
         self.gradient = ScreenGradient(len(model))
         self._quantizer: Quantizer | None = None
         self._drawn: Gaussians | None = None
@@ -242,8 +240,7 @@ class Solver:
 
     def worth_keeping(self) -> np.ndarray:
         """Rows that pruning leaves, bool [N]."""
-        keep = prune(self.model, self.gradient, bounds=self.bounds, options=self._options.density, uv=self._options.uv)
-        return keep if self.free_space is None else keep & ~self.free_space.contains(self.model.gaussians.means)
+        return prune(self.model, self.gradient, bounds=self.bounds, options=self._options.density, uv=self._options.uv)
 
     def _round(self, of: int) -> None:
         """Prune, then grow towards the cap."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,14 +32,16 @@ class Bounds:
 
 @dataclass(frozen=True)
 class StartOptions:
-    count: int = 20_000
+    count: int = 22_000
     """Gaussians at the start"""
     volume: float = 1.25
     """Random Gaussians fill a ball of this many radii about the centre"""
     min_views: int = 3
     """Cameras that must see a random Gaussian; all of them in smaller rigs"""
-    point_share: float = 0.5
-    """At most this share of the start comes from sparse points, the rest fills the volume"""
+    surface_share: float = 0.45
+    """At most this share starts on places that cameras agree on: triangulated points and sure places of the shell"""
+    shell_share: float = 0.3
+    """This share covers the rest of the shell evenly; what is left fills the volume"""
     opacity: float = 0.1
     """Opacity of every Gaussian at the start"""
 
@@ -52,16 +54,6 @@ class Points:
     """float64 [P, 3], world"""
     rgb: np.ndarray
     """float64 [P, 3], in [0, 1]"""
-
-
-@dataclass(frozen=True)
-class Sights:
-    """Which camera sees which place: R lines that nothing crosses."""
-
-    origins: np.ndarray
-    """float64 [R, 3], camera centres, world"""
-    ends: np.ndarray
-    """float64 [R, 3]"""
 
 
 def find_bounds(cameras: Sequence[PinholeCamera], *, near_share: float) -> Bounds:
@@ -85,23 +77,36 @@ def first_gaussians(
     pictures: Sequence[np.ndarray],  # float32 [3, H, W] in [0, 1]
     *,
     bounds: Bounds,
-    points: Points | None,
-    empty: Callable[[np.ndarray], np.ndarray] | None = None,
+    surface: Points | None,
     options: StartOptions,
     sh_degree: int,
     seed: int,
 ) -> Gaussians:
-    """Gaussians on the sparse points and at random in the volume that several cameras see, coloured by the pictures.
+    """Gaussians on the points of the surface and at random in the volume that several cameras see, `options.count`
+    together, coloured by the pictures.
 
-    `empty` tells which points [N, 3] cannot be. Raises ValueError if no place is seen by enough cameras.
+    Raises ValueError if no place is seen by enough cameras.
     """
     rng = np.random.default_rng(seed)
-    chosen = _choose_points(points, round(options.count * options.point_share), rng)
-    volume = _random_points(cameras, pictures, bounds, empty, options, options.count - len(chosen.xyz), rng)
-    xyz, rgb = (np.concatenate([getattr(chosen, name), getattr(volume, name)]) for name in ("xyz", "rgb"))
+    surface = no_points() if surface is None else surface
+    volume = _random_points(cameras, pictures, bounds, options, max(0, options.count - len(surface.xyz)), rng)
+    xyz, rgb = (np.concatenate([getattr(surface, name), getattr(volume, name)]) for name in ("xyz", "rgb"))
     spacing = neighbour_distance(xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 2 * np.median(spacing))
     return round_gaussians(xyz, rgb, scale, opacity=options.opacity, sh_degree=sh_degree)
+
+
+def no_points() -> Points:
+    return Points(np.empty((0, 3)), np.empty((0, 3)))
+
+
+def drawn(points: Points, count: int, rng: np.random.Generator, *, weight: np.ndarray | None = None) -> Points:
+    """At most `count` of the points, at random, in proportion to `weight` [P] if given."""
+    if len(points.xyz) <= count:
+        return points
+    share = None if weight is None else weight / weight.sum()
+    rows = np.sort(rng.choice(len(points.xyz), count, replace=False, p=share))
+    return Points(points.xyz[rows], points.rgb[rows])
 
 
 def round_gaussians(
@@ -140,34 +145,24 @@ def pixels_of(camera: PinholeCamera, xyz: np.ndarray, near: float) -> tuple[np.n
     return inside, y[inside].astype(np.int64), x[inside].astype(np.int64)
 
 
-def _choose_points(points: Points | None, count: int, rng: np.random.Generator) -> Points:
-    if points is None:
-        return Points(np.empty((0, 3)), np.empty((0, 3)))
-    if len(points.xyz) <= count:
-        return points
-    rows = np.sort(rng.choice(len(points.xyz), count, replace=False))
-    return Points(points.xyz[rows], points.rgb[rows])
-
-
 def _random_points(
     cameras: Sequence[PinholeCamera],
     pictures: Sequence[np.ndarray],
     bounds: Bounds,
-    empty: Callable[[np.ndarray], np.ndarray] | None,
     options: StartOptions,
     count: int,
     rng: np.random.Generator,
 ) -> Points:
     needed = min(options.min_views, len(cameras))
     xyz, rgb = np.empty((0, 3)), np.empty((0, 3))
-    for _ in range(_ROUNDS):
-        drawn = random_ball(rng, 4 * count) * options.volume * bounds.radius + bounds.centre
-        drawn = drawn if empty is None else drawn[~empty(drawn)]
-        colours, views = seen_colours(cameras, pictures, drawn, bounds.near)
-        xyz, rgb = np.concatenate([xyz, drawn[views >= needed]]), np.concatenate([rgb, colours[views >= needed]])
+    for _ in range(_ROUNDS if count else 0):
+        places = random_ball(rng, 4 * count) * options.volume * bounds.radius + bounds.centre
+        colours, views = seen_colours(cameras, pictures, places, bounds.near)
+        seen = views >= needed
+        xyz, rgb = np.concatenate([xyz, places[seen]]), np.concatenate([rgb, colours[seen]])
         if len(xyz) >= count:
             break
-    if not len(xyz):
+    if count and not len(xyz):
         raise ValueError(
             f"no place within {options.volume} rig radii is seen by {needed} cameras; check the calibration: "
             "do the cameras look at a common volume?"

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from calibration.rig import Rig
 from calibration.triangulate import SparsePoints
 from packuv import fit
 from packuv.files import write_json
@@ -16,7 +15,7 @@ from packuv.fit import KeyState
 from packuv.frames import Views
 from packuv.motion import MotionCache, MotionOptions, changed_between
 from packuv.solver import FitOptions
-from packuv.start import Points, Sights
+from packuv.start import Points
 from packuv.stream import hold_absent
 from tasks.calibrate import POINTS
 from tasks.footage import Footage, PictureOptions, footage_of
@@ -59,7 +58,7 @@ def fit_next(
     options: FitOptions,
 ) -> Key:
     """Fit the keyframe at instant `step[1]` from the one at `step[0]`."""
-    options = _without(options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift")
+    options = _without(options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell")
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "previous": workshop.path(previous),
@@ -85,7 +84,7 @@ def fit_segment(
     options: FitOptions,
 ) -> Key:
     """Fit the instants of a segment, which starts with its keyframe: segment.npz and fit.json."""
-    options = _without(options, "iterations", "key_iterations", "coarse_share", "float_share", "start")
+    options = _without(options, "iterations", "key_iterations", "coarse_share", "float_share", "start", "shell")
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "key": workshop.path(key),
@@ -101,10 +100,8 @@ def fit_segment(
 
 def build_first(footage: Footage, points: Path, options: FitOptions, out: Path, progress: Progress) -> dict[str, Any]:
     """The job behind `fit_first`."""
-    known, sights = _evidence(SparsePoints.load(points), footage.load_rig()) if points.exists() else (None, None)
-    state = fit.fit_first(
-        footage.open_views(), 0, points=known, sights=sights, options=options, progress=_counted(progress)
-    )
+    known = _sure_points(SparsePoints.load(points)) if points.exists() else None
+    state = fit.fit_first(footage.open_views(), 0, points=known, options=options, progress=_counted(progress))
     state.save(out)
     return dict(state.figures)
 
@@ -151,13 +148,10 @@ def build_segment(
     return {"frames": len(segment), "gaussians": len(segment.key), "dynamic": int(segment.dynamic.sum())}
 
 
-def _evidence(sparse: SparsePoints, rig: Rig) -> tuple[Points, Sights]:
-    """Where surfaces surely are at the first instant, and what cameras look through."""
+def _sure_points(sparse: SparsePoints) -> Points:
+    """Where surfaces surely are at the first instant."""
     sure = (sparse.views >= SURE_VIEWS) & (sparse.instant == 0)
-    seen = sure[sparse.point]
-    centres = rig.select(sparse.cameras).centres  # [C, 3], world
-    sights = Sights(centres[sparse.camera[seen]], sparse.xyz[sparse.point[seen]])
-    return Points(sparse.xyz[sure], sparse.rgb[sure] / 255), sights
+    return Points(sparse.xyz[sure], sparse.rgb[sure] / 255)
 
 
 def _changes(views: Views, first: int, last: int, options: MotionOptions) -> list[np.ndarray | None]:

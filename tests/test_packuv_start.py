@@ -47,7 +47,7 @@ def test_the_first_gaussians_are_seen_and_take_the_colours_of_the_pictures(ring)
     bounds = find_bounds(cameras, near_share=0.1)
     known = Points(np.array([[0.1, 0.2, 0.0]]), np.array([[1.0, 0.5, 0.0]]))
     g = first_gaussians(
-        cameras, pictures, bounds=bounds, points=known, options=StartOptions(count=300), sh_degree=1, seed=3
+        cameras, pictures, bounds=bounds, surface=known, options=StartOptions(count=300), sh_degree=1, seed=3
     )
     assert len(g) == 300
     np.testing.assert_allclose(g.means[0], known.xyz[0], rtol=1e-6)
@@ -66,7 +66,7 @@ def test_cameras_without_a_common_volume_are_refused(ring):
     pictures = [np.zeros((3, 64, 96), np.float32)] * 4
     bounds = find_bounds(ring(4), near_share=0.1)
     with pytest.raises(ValueError, match="do the cameras look at a common volume"):
-        first_gaussians(away, pictures, bounds=bounds, points=None, options=StartOptions(count=50), sh_degree=0, seed=0)
+        first_gaussians(away, pictures, bounds=bounds, surface=None, options=StartOptions(count=50), sh_degree=0, seed=0)
 
 
 def test_hull_points_lie_where_the_masks_meet(ring):
