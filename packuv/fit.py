@@ -1,7 +1,7 @@
 """Fit Gaussians to the pictures of many cameras: the keyframe chain and the frames of each segment (paper §4.2).
 
     fit_first     pictures of one instant -> the first keyframe, and the quantizer of the whole sequence
-    fit_next      a keyframe and the pictures of a later instant -> the next one; what did not change keeps its codes
+    fit_next      a keyframe and the pictures of another's instant -> that one; what did not change keeps its codes
     fit_segment   a keyframe and the instants after it -> a `Segment`; frame by frame, from each to the next
 
 From the moment the quantizer is fixed every iteration renders decoded codes and the gradient passes straight through
@@ -18,13 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
+from packuv.background import Still, find_background
 from packuv.density import opacity
 from packuv.files import write_json, write_npz
 from packuv.frames import Views
 from packuv.labels import active_tiles, dynamic_labels
 from packuv.lift import lift_motion
 from packuv.model import ATTRIBUTES, Model, canonical, rows_of
-from packuv.motion import MotionCache
+from packuv.motion import MotionCache, MotionOptions, difference
 from packuv.quantize import OPACITY, OPACITY_RANGE, Codes, Gaussians, Quantizer, attribute_values
 from packuv.segment import Segment
 from packuv.shell import sweep_shell
@@ -81,31 +82,42 @@ def fit_first(
     instant: int,
     *,
     points: Points | None,
+    motion: MotionOptions,
     options: FitOptions,
     progress: Progress | None = None,
 ) -> KeyState:
-    """Fit the first keyframe from sparse points, the shell around the scene and random Gaussians.
+    """Fit the first keyframe from sparse points, the shell around the scene and random Gaussians: the background of
+    the sequence first, then what stands before it.
 
     `views` must hold the cameras to fit and no others. Raises ValueError if fewer than two have a picture.
     """
     started = time.monotonic()
     shots = _shots(views, instant)
+    stills = find_background(views, options.background) if options.background.iteration_share else []
+    still_shots = [Shot(views.cameras[s.camera], views.balanced(s.camera, s.pixels), known=s.known) for s in stills]
+    first = still_shots if len(still_shots) >= len(shots) else shots
     bounds = find_bounds(views.cameras, near_share=options.near_share)
-    surface = _surface(shots, points, bounds, options)
-    start = first_gaussians([s.camera for s in shots], [s.target for s in shots], bounds=bounds, surface=surface,
-                            options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
+    rng = np.random.default_rng([options.seed, instant, 0])
+    start = first_gaussians([s.camera for s in first], [s.target for s in first], bounds=bounds,
+                            surface=_surface(first, points, bounds, options), options=options.start,
+                            sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
     model = Model(start)
-    solver = Solver(model, bounds, options, np.random.default_rng([options.seed, instant, 0]))
-    ticks = Ticks(progress, options.iterations)
-    coarse = round(options.iterations * options.coarse_share)
-    floating = max(coarse, round(options.iterations * options.float_share))
-    solver.run([halved(shot) for shot in shots], coarse, of=options.iterations, dense=True, ticks=ticks)
-    solver.run(shots, floating - coarse, of=options.iterations, dense=True, ticks=ticks)
+    solver = Solver(model, bounds, options, rng)
+    total = options.iterations
+    ticks = Ticks(progress, total)
+    coarse, floating = round(total * options.coarse_share), round(total * options.float_share)
+    solver.run([halved(shot) for shot in first], coarse, of=total, dense=True, ticks=ticks)
+    if first is still_shots:
+        solver.run(first, round(total * options.background.iteration_share) - coarse, of=total, dense=True, ticks=ticks)
+        masks = _before_background(views, instant, stills, motion)
+        born = _hull_gaussians(views, instant, masks, bounds, options, rng)
+        solver.append(rows_of(born, slice(0, max(0, options.density.cap - len(model)))))
+    solver.run(shots, floating - solver.done, of=total, dense=True, ticks=ticks)
     solver.keep(solver.worth_keeping())
     model.gaussians = canonical(model.gaussians)
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
     solver.fix(choose_quantizer(model.gaussians, bounds, options.sh_degree))
-    loss = solver.run(shots, options.iterations - floating, of=options.iterations, ticks=ticks)
+    loss = solver.run(shots, total - floating, of=total, ticks=ticks)
     return KeyState(instant, model.gaussians, solver.known_quantizer, bounds, _figures(started, loss, solver))
 
 
@@ -118,7 +130,7 @@ def fit_next(
     options: FitOptions,
     progress: Progress | None = None,
 ) -> KeyState:
-    """Fit a later keyframe from the one before it.
+    """Fit a keyframe from a neighbouring one, later or earlier.
 
     `masks` tell, per camera of `views`, what differs between the two instants, bool [H, W] (None: unknown, the whole
     picture may). Gaussians that touch no mask keep every code. New ones are born where the masks meet.
@@ -201,6 +213,17 @@ def _fit_frame(
     figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count, "loss": loss,
                "dynamic": int(changed.sum()), "tiles": tiles}  # fmt: skip
     return changed, figures
+
+
+def _before_background(
+    views: Views, instant: int, stills: Sequence[Still], motion: MotionOptions
+) -> list[np.ndarray | None]:
+    """What each camera's picture shows that its background lacks, bool [H, W]; None without one of the two."""
+    masks: list[np.ndarray | None] = [None] * len(views.cameras)
+    for still in stills:
+        pixels = views.pixels(still.camera, instant)
+        masks[still.camera] = None if pixels is None else difference(still.pixels, pixels, motion)
+    return masks
 
 
 def _surface(shots: Sequence[Shot], points: Points | None, bounds: Bounds, options: FitOptions) -> Points:

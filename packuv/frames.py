@@ -239,8 +239,10 @@ class Views:
     def picture(self, camera: int, instant: int) -> np.ndarray | None:
         """Colour-balanced picture, float32 [3, H, W] in [0, 1], or None where the camera has no frame."""
         pixels = self.pixels(camera, instant)
-        if pixels is None:
-            return None
+        return None if pixels is None else self.balanced(camera, pixels)
+
+    def balanced(self, camera: int, pixels: np.ndarray) -> np.ndarray:
+        """Pixels of a camera, uint8 [H, W, 3], in the rig's common colour: float32 [3, H, W] in [0, 1]."""
         picture = np.empty((3, *pixels.shape[:2]), dtype=np.float32)
         for channel, table in enumerate(self._tables[camera]):
             picture[channel] = cv2.LUT(cv2.extractChannel(pixels, channel), table)

@@ -120,6 +120,22 @@ def segments(keyframes: Sequence[Keyframe], count: int) -> list[range]:
     return [range(first, last) for first, last in zip(starts, [*starts[1:], count], strict=True)]
 
 
+def fitting_order(pictures: Sequence[int]) -> tuple[int, list[tuple[int, int]]]:
+    """The keyframe that is fitted first, and then each of the others with the one that it is fitted from.
+
+    `pictures` counts the cameras that filmed each keyframe. The chain starts where most did, at the first of equals,
+    because what a camera shows of the still part of a scene must be known before that part is kept; from there it
+    goes to both ends.
+
+    >>> fitting_order([8, 9, 9])
+    (1, [(2, 1), (0, 1)])
+    """
+    anchor = max(range(len(pictures)), key=lambda index: (pictures[index], -index))
+    later = [(index, index - 1) for index in range(anchor + 1, len(pictures))]
+    earlier = [(index, index + 1) for index in range(anchor - 1, -1, -1)]
+    return anchor, [*later, *earlier]
+
+
 def _peaks(curve: np.ndarray, prominence: float) -> list[int]:
     """Local maxima that stand out, the highest first. Of a plateau the first instant counts; the ends are no peaks."""
     starts = np.flatnonzero(np.diff(curve, prepend=np.nan) != 0)  # of runs of equal values

@@ -198,8 +198,11 @@ def changed_between(views: Views, camera: int, first: int, last: int, options: M
     None where the camera lacks one of the two pictures. Slow motion that no single step shows adds up to a change here.
     """
     before, after = views.pixels(camera, first), views.pixels(camera, last)
-    if before is None or after is None:
-        return None
+    return None if before is None or after is None else difference(before, after, options)
+
+
+def difference(before: np.ndarray, after: np.ndarray, options: MotionOptions) -> np.ndarray:
+    """What differs between two pictures of a camera, uint8 [H, W, 3] each: bool [H, W], dilated."""
     step = measure_step(_grey(before), _grey(after), options)
     return grown(step.mask, before.shape[1], before.shape[0], options.dilation_px)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from packuv.background import BackgroundOptions
 from packuv.camera import PinholeCamera
 from packuv.density import DensityOptions, ScreenGradient, grow, opacity, prune, relocate
 from packuv.labels import LabelOptions
@@ -75,6 +76,7 @@ class FitOptions:
     settle: float = 0.003
     """A frame stops when a pass over the cameras improves the loss by less than this share"""
     seed: int = 0
+    background: BackgroundOptions = field(default_factory=BackgroundOptions)
     shell: ShellOptions = field(default_factory=ShellOptions)
     start: StartOptions = field(default_factory=StartOptions)
     density: DensityOptions = field(default_factory=DensityOptions)
@@ -100,13 +102,19 @@ class Shot:
     """float32 [3, H, W] in [0, 1]"""
     tiles: np.ndarray | None = None
     """bool [tiles_y, tiles_x] where the picture counts; None: everywhere"""
+    known: np.ndarray | None = None
+    """bool [H, W] where the picture counts within these tiles; None: everywhere"""
 
 
 def halved(shot: Shot) -> Shot:
     """The same picture at half its size."""
     camera = shot.camera.scaled(max(16, shot.camera.width // 2), max(16, shot.camera.height // 2))
-    small = cv2.resize(shot.target.transpose(1, 2, 0), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return Shot(camera, np.ascontiguousarray(small.transpose(2, 0, 1)))
+    size = camera.width, camera.height
+    small = cv2.resize(shot.target.transpose(1, 2, 0), size, interpolation=cv2.INTER_AREA)
+    known = None
+    if shot.known is not None:
+        known = cv2.resize(shot.known.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return Shot(camera, np.ascontiguousarray(small.transpose(2, 0, 1)), known=known)
 
 
 class Solver:
@@ -192,7 +200,9 @@ class Solver:
         options, drawn = self._options, self._decoded()
         rendering = render(drawn, shot.camera, options=RasterOptions(self._near()), tiles=shot.tiles,
                            workspace=self._workspace)  # fmt: skip
-        loss = photometric_loss(rendering.colour, shot.target, options=options.photometric, tiles=shot.tiles)
+        # What is not known is taken for right as it is.
+        target = shot.target if shot.known is None else np.where(shot.known, shot.target, rendering.colour)
+        loss = photometric_loss(rendering.colour, target, options=options.photometric, tiles=shot.tiles)
         if not np.isfinite(loss.value):
             raise ValueError(f"the loss of camera {shot.camera.name!r} is {loss.value} in iteration {self.done}: its "
                              "picture or the Gaussians hold values that are not finite")  # fmt: skip

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from packuv.keyframes import fitting_order
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
@@ -18,7 +19,7 @@ from tasks.calibrate import find_points, find_rig
 from tasks.encode import encode, verify
 from tasks.evaluate import evaluate
 from tasks.plan import Plan
-from tasks.splat import fit_first, fit_next, fit_segment
+from tasks.splat import count_pictures, fit_first, fit_next, fit_segment
 from tasks.store import Key
 from tasks.synchronize import synchronize
 from tasks.track import choose_keyframes, find_motion, read_spans
@@ -102,16 +103,23 @@ def _fit(workshop: Workshop, plan: Plan, options: SequenceOptions, submit: Submi
 
     The next keyframe is submitted before the segment, because the chain is the longest way through the work.
     """
-    sources = (workshop, plan, made.only("sync"), made.only("points"))
+    groups, points = made.only("sync"), made.only("points")
     spans = read_spans(workshop, made.only("keyframes"))
-    key = made.add(submit(fit_first, *sources, options.pictures, options.fit).result())
-    segments = []
-    for span, after in zip(spans, [*spans[1:], None], strict=True):
-        following = None
-        if after is not None:
-            step = (span.start, after.start)
-            following = submit(fit_next, *sources, key, step, options.pictures, options.motion, options.fit)
-        segments.append(submit(fit_segment, *sources, made.only("motion"), key, span, options.pictures, options.fit))
-        if following is not None:
-            key = made.add(following.result())
-    made.add(*(segment.result() for segment in segments))
+    sources, settings = (workshop, plan, groups, points), (options.pictures, options.motion, options.fit)
+    instants = [span.start for span in spans]
+    anchor, steps = fitting_order(count_pictures(workshop, plan, groups, instants))
+    keys = {anchor: submit(fit_first, *sources, instants[anchor], *settings).result()}
+    segments: dict[int, Future] = {}
+
+    def start_segment(index: int) -> None:
+        parts = (made.only("motion"), keys[index], spans[index], options.pictures, options.fit)
+        segments[index] = submit(fit_segment, *sources, *parts)
+
+    last = anchor
+    for index, start in steps:
+        following = submit(fit_next, *sources, keys[start], (instants[start], instants[index]), *settings)
+        start_segment(last)
+        keys[index], last = following.result(), index
+    start_segment(last)
+    made.add(*(keys[index] for index in range(len(spans))))
+    made.add(*(segments[index].result() for index in range(len(spans))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,13 @@ from packuv.motion import MotionCache, MotionOptions, changed_between
 from packuv.solver import FitOptions
 from packuv.start import Points
 from packuv.stream import hold_absent
+from sync.align import FrameGroups
 from tasks.calibrate import POINTS
 from tasks.footage import Footage, PictureOptions, footage_of
 from tasks.jobs import Progress
 from tasks.plan import Plan
 from tasks.store import Key
+from tasks.synchronize import selected
 from tasks.track import MOTION
 from tasks.workshop import Workshop
 
@@ -31,19 +34,39 @@ SURE_VIEWS = 3
 """Cameras that must see a point for Gaussians to start there; two may agree by chance"""
 
 
+def count_pictures(workshop: Workshop, plan: Plan, groups: Key, instants: Sequence[int]) -> list[int]:
+    """How many of the fitted cameras filmed each of the plan's instants."""
+    found = FrameGroups.load(workshop.path(groups))
+    columns = [found.cameras.index(name) for name in plan.fitted]
+    first = selected(found, plan.first, plan.stop).start
+    return [int((found.frames[first + instant, columns] >= 0).sum()) for instant in instants]
+
+
 def fit_first(
-    workshop: Workshop, plan: Plan, groups: Key, points: Key, pictures: PictureOptions, options: FitOptions
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    points: Key,
+    instant: int,
+    pictures: PictureOptions,
+    motion: MotionOptions,
+    options: FitOptions,
 ) -> Key:
-    """Fit the first keyframe: state.npz and key.json, which holds the quantizer of the whole sequence."""
+    """Fit the keyframe that the chain starts with: state.npz and key.json, with the quantizer of all."""
     options = _without(options, "key_iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "labels")
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "points": workshop.path(points) / POINTS,
+        "instant": instant,
+        "motion": motion,
         "options": options,
     }
-    reads = _reads(plan, pictures, options)
+    # The background is the median of the whole range, so its end counts here.
+    reads = {**_reads(plan, pictures, options), "instant": instant, "stop": plan.stop, "motion": motion}
     inputs = {"groups": groups, "points": points}
-    return workshop.make("key", VERSION, reads, inputs, "tasks.splat:build_first", arguments, label="fit key 0")
+    return workshop.make(
+        "key", VERSION, reads, inputs, "tasks.splat:build_first", arguments, label=f"fit key {instant}"
+    )
 
 
 def fit_next(
@@ -58,7 +81,9 @@ def fit_next(
     options: FitOptions,
 ) -> Key:
     """Fit the keyframe at instant `step[1]` from the one at `step[0]`."""
-    options = _without(options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell")
+    options = _without(
+        options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell", "background"
+    )
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "previous": workshop.path(previous),
@@ -84,7 +109,9 @@ def fit_segment(
     options: FitOptions,
 ) -> Key:
     """Fit the instants of a segment, which starts with its keyframe: segment.npz and fit.json."""
-    options = _without(options, "iterations", "key_iterations", "coarse_share", "float_share", "start", "shell")
+    options = _without(
+        options, "iterations", "key_iterations", "coarse_share", "float_share", "start", "shell", "background"
+    )
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "key": workshop.path(key),
@@ -98,10 +125,20 @@ def fit_segment(
     return workshop.make("segment", VERSION, reads, inputs, "tasks.splat:build_segment", arguments, label=label)
 
 
-def build_first(footage: Footage, points: Path, options: FitOptions, out: Path, progress: Progress) -> dict[str, Any]:
+def build_first(
+    footage: Footage,
+    points: Path,
+    instant: int,
+    motion: MotionOptions,
+    options: FitOptions,
+    out: Path,
+    progress: Progress,
+) -> dict[str, Any]:
     """The job behind `fit_first`."""
     known = _sure_points(SparsePoints.load(points)) if points.exists() else None
-    state = fit.fit_first(footage.open_views(), 0, points=known, options=options, progress=_counted(progress))
+    state = fit.fit_first(
+        footage.open_views(), instant, points=known, motion=motion, options=options, progress=_counted(progress)
+    )
     state.save(out)
     return dict(state.figures)
 
@@ -149,8 +186,8 @@ def build_segment(
 
 
 def _sure_points(sparse: SparsePoints) -> Points:
-    """Where surfaces surely are at the first instant."""
-    sure = (sparse.views >= SURE_VIEWS) & (sparse.instant == 0)
+    """Where surfaces surely are; of what moved on since, a fit prunes the few points that it starts with."""
+    sure = sparse.views >= SURE_VIEWS
     return Points(sparse.xyz[sure], sparse.rgb[sure] / 255)
 
 
@@ -159,7 +196,7 @@ def _changes(views: Views, first: int, last: int, options: MotionOptions) -> lis
 
 
 def _reads(plan: Plan, pictures: PictureOptions, options: FitOptions) -> dict[str, Any]:
-    """Instants count from the plan's first one; where the plan ends changes no keyframe or segment before the end."""
+    """Instants count from the plan's first one."""
     return {
         "fit": options,
         "fit_version": fit.VERSION,

@@ -53,7 +53,7 @@ def views(ring, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def key(views) -> KeyState:
-    return fit_first(views, 0, points=None, options=OPTIONS)
+    return fit_first(views, 0, points=None, motion=MOTION, options=OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +91,8 @@ def test_the_first_keyframe_explains_its_pictures_through_its_codes(views, key):
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(views, key):
-    assert same(fit_first(views, 0, points=None, options=OPTIONS).gaussians, key.gaussians)
-    other = fit_first(views, 0, points=None, options=dataclasses.replace(OPTIONS, seed=1))
+    assert same(fit_first(views, 0, points=None, motion=MOTION, options=OPTIONS).gaussians, key.gaussians)
+    other = fit_first(views, 0, points=None, motion=MOTION, options=dataclasses.replace(OPTIONS, seed=1))
     assert other.gaussians.means.shape != key.gaussians.means.shape or not same(other.gaussians, key.gaussians)
 
 

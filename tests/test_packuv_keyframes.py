@@ -13,6 +13,7 @@ from packuv.keyframes import (
     Reason,
     _peaks,
     choose_keyframes,
+    fitting_order,
     motion_curve,
     running_mean,
     segments,
@@ -131,3 +132,15 @@ def test_bad_input_is_refused() -> None:
         choose_keyframes(np.array([0.0, np.nan]), KeyframeOptions())
     with pytest.raises(ValueError, match="must ascend from 0"):
         segments([Keyframe(3, Reason.START)], 5)
+
+
+def test_the_chain_starts_where_most_cameras_filmed_and_reaches_every_keyframe_once():
+    assert fitting_order([4]) == (0, [])
+    assert fitting_order([4, 4, 4]) == (0, [(1, 0), (2, 1)])
+    anchor, steps = fitting_order([3, 5, 8, 8, 2])
+    assert anchor == 2
+    known = {anchor}
+    for index, start in steps:
+        assert start in known and abs(index - start) == 1
+        known.add(index)
+    assert known == set(range(5))
