@@ -1,12 +1,14 @@
-"""Size and speed of the scene file, beside plain FFV1 of the whole atlas.
+"""Size, speed and distortion of the scene file, beside plain FFV1 of the whole atlas and beside other codecs.
 
-    python -m bench.codec --out runs/codec.json                      # a made-up sequence
+    python -m bench.codec --scene SCENE.mkv --capture CAPTURE --out bench/results/codec.json --plot rate.svg
+    python -m bench.codec --frames 30 --keyframes 4 --out runs/codec.json          # a made-up sequence
     python -m bench.codec --segments S0.npz S1.npz --quantizer quantizer.json --out runs/codec.json
 
-The made-up sequence puts a moving, turning, bending actor among static surroundings. Its Gaussians are those of a
-trained scenes (`splats/*.compressed.ply` under PACKUV_DATA) or, without them, drawn on made-up surfaces; the noise that
-a fit leaves in moving Gaussians is imitated by an AR(1) process. Wall time on a shared machine is noisy: compare
-rows of one run.
+`compact` rows are scene files, lossless and at each quality, written, verified and read. `plain atlas` rows code every
+byte plane of the whole 2048 x 1024 atlas in every frame, as the paper does, and `pictures` rows code the compact file's
+own pictures with other codecs, which must give back every byte. Distortion is the PSNR of renders from cameras that
+were not fitted against renders of the lossless scene and, with --capture, against what those cameras filmed. Wall time
+on a shared machine is noisy: compare rows of one run, and CPU seconds, which count all threads.
 """
 
 from __future__ import annotations
@@ -14,232 +16,100 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
+import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 
-from packuv.interchange import read_ply
+from bench.made_up import SequenceOptions, find_gaussians, make_sequence
+from packuv.encoder import TOLERANCES, Quality
+from packuv.header import DYNAMIC, KEY
 from packuv.matroska import Encoder, Track
-from packuv.quantize import OPACITY, OPACITY_RANGE, ROTATION, Codes, Gaussians, Quantizer, attribute_values
-from packuv.scene import SceneHeader, open_scene, write_scene
+from packuv.quantize import OPACITY, Codes, Quantizer
+from packuv.scene import EncodeOptions, Scene, SceneHeader, open_scene, write_scene
 from packuv.segment import Segment
 from packuv.stream import channel_names, key_rows
 from packuv.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
-
-DATA = Path(os.environ.get("PACKUV_DATA", Path(__file__).parents[1] / "../shared/data"))
+from tasks.evaluate import Artist, EvaluateOptions, evaluate_scene, spread
 
 
 @dataclass(frozen=True)
-class SequenceOptions:
-    """A made-up sequence."""
+class Codec:
+    """A video codec of FFmpeg, set to be lossless."""
 
-    frames: int = 30
-    """Frames of one segment, its keyframe included"""
-    keyframes: int = 1
-    """Segments, each of `frames` frames"""
-    still: int = 260_000
-    """Gaussians of the surroundings before the UV map prunes"""
-    restless: int = 23_000
-    """Of these, how many do not move but are labelled dynamic, and so get noise"""
-    actor: int = 60_000
-    """Gaussians of the actor"""
-    noise: float = 1.0
-    """Strength of the fit's noise; 1: 0.03 in log scale, 0.01 in rotation, 0.1 in logit, 0.02 in colour, 5 % of the
-    own size in position, correlated 0.9 from frame to frame"""
-    seed: int = 1
+    encoder: str
+    pixels: str
+    """Pixel format; of those with colour only the luma carries data"""
+    options: tuple[tuple[str, str], ...] = ()
 
 
-# Sources of Gaussians
+CODECS = {
+    "ffv1": Codec("ffv1", "gray", (("level", "3"), ("coder", "1"), ("slices", "4"), ("slicecrc", "1"), ("g", "1"))),
+    "huffyuv": Codec("ffvhuff", "gray"),
+    "x264": Codec("libx264", "yuv420p", (("qp", "0"), ("preset", "medium"))),
+    "hevc": Codec("libx265", "yuv420p", (("x265-params", "lossless=1:log-level=error"), ("preset", "medium"))),
+    "vp9": Codec("libvpx-vp9", "yuv420p", (("lossless", "1"), ("cpu-used", "4"))),
+    "av1": Codec("libsvtav1", "yuv420p", (("svtav1-params", "lossless=1"), ("preset", "8"))),
+}
 
 
-def trained_gaussians(folder: Path) -> Gaussians:
-    """All trained scenes of a folder (compressed PLY, y down), as one cloud with z up."""
-    scenes = [read_ply(path) for path in sorted(folder.glob("*.compressed.ply"))]
-    up = np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0])
-    return _turned(_join([_placed(scene, 2.0, np.zeros(3)) for scene in scenes]), up)
+# The scene file
 
 
-def made_up_gaussians(n: int, rng: np.random.Generator) -> Gaussians:
-    """Flat Gaussians on a bumpy ball about 2 across, with a texture."""
-    direction = rng.normal(size=(n, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    bumps = 0.1 * np.sin(7 * direction[:, 0] + 3 * direction[:, 1]) + 0.05 * np.sin(19 * direction[:, 2])
-    means = direction * (1 + bumps)[:, None]
-    scales = np.log([0.02, 0.015, 0.003]) + rng.normal(0, 0.4, (n, 3))
-    quaternions = np.concatenate([np.ones((n, 1)), direction + rng.normal(0, 0.1, (n, 3))], axis=1)
-    texture = np.sin(means @ rng.normal(0, 12, (3, 3))) + rng.normal(0, 0.1, (n, 3))
-    return Gaussians(means, scales, _unit(quaternions), rng.normal(1.5, 2, n), texture[:, None])
-
-
-def _unit(quaternions: np.ndarray) -> np.ndarray:
-    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-
-
-# The sequence
-
-
-def _pick(g: Gaussians, rows: np.ndarray) -> Gaussians:
-    return Gaussians(g.means[rows], g.log_scales[rows], g.quaternions[rows], g.opacity_logits[rows], g.sh[rows])
-
-
-def _join(parts: Sequence[Gaussians]) -> Gaussians:
-    names = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
-    return Gaussians(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-def _placed(g: Gaussians, height: float, offset: np.ndarray) -> Gaussians:
-    """Scaled to a height in metres, its middle put at `offset`."""
-    low, high = np.percentile(g.means, [1, 99], axis=0)
-    factor = height / (high - low).max()
-    return replace(g, means=(g.means - (low + high) / 2) * factor + offset, log_scales=g.log_scales + np.log(factor))
-
-
-def _turned(g: Gaussians, rotation: np.ndarray) -> Gaussians:
-    """Turned about the origin by unit quaternions [4] or [n, 4], w x y z."""
-    rotation = np.broadcast_to(rotation, (len(g), 4))
-    w, u, v = rotation[:, :1], rotation[:, 1:], g.quaternions[:, 1:]
-    across = 2 * np.cross(u, g.means)
-    scalar = w * g.quaternions[:, :1] - (u * v).sum(axis=1, keepdims=True)
-    vector = w * v + g.quaternions[:, :1] * u + np.cross(u, v)
-    means = g.means + w * across + np.cross(u, across)
-    return replace(g, means=means, quaternions=np.concatenate([scalar, vector], axis=1))
-
-
-def _about_z(angle: np.ndarray | float) -> np.ndarray:
-    half = np.asarray(angle) / 2
-    return np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
-
-
-def _surroundings(source: Gaussians, count: int, rng: np.random.Generator) -> Gaussians:
-    """Twelve different, larger samples of the source, which stand all around at 4 to 7 m."""
-    parts = []
-    for k in range(12):
-        part = _pick(source, rng.permutation(len(source))[: count // 12])
-        radius, azimuth = 4 + k % 4, k * np.pi / 6
-        place = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), 0])
-        parts.append(_placed(_turned(part, _about_z(1.1 * k)), 1.6 * radius, place))
-    return _join(parts)
-
-
-def _posed(actor: Gaussians, seconds: float) -> Gaussians:
-    """The actor at a time: it turns, bends with height and wanders, about 25 mm a frame."""
-    bend = 0.25 * np.sin(2 * np.pi * seconds * 0.8) * actor.means[:, 2] / 0.9
-    turned = _turned(actor, _about_z(0.6 * np.sin(np.pi * seconds) + bend))
-    way = [0.5 * np.sin(0.8 * np.pi * seconds), 0.6 * np.sin(seconds), 0.05 * np.sin(4 * np.pi * seconds)]
-    return replace(turned, means=turned.means + way)
-
-
-class _FitNoise:
-    """AR(1) noise on every attribute of the dynamic Gaussians."""
-
-    def __init__(self, g: Gaussians, strength: float, rng: np.random.Generator) -> None:
-        self._rng, size = rng, np.exp(g.log_scales.mean(axis=1, keepdims=True))
-        self._sigma = [strength * s for s in (0.05 * size, 0.03, 0.01, 0.10, 0.02)]
-        self._state = [np.zeros_like(a) for a in _arrays(g)]
-
-    def step(self) -> None:
-        draws = (sigma * self._rng.standard_normal(s.shape) for s, sigma in zip(self._state, self._sigma, strict=True))
-        self._state = [0.9 * s + draw for s, draw in zip(self._state, draws, strict=True)]
-
-    def on(self, g: Gaussians) -> Gaussians:
-        noisy = Gaussians(*(a + s for a, s in zip(_arrays(g), self._state, strict=True)))
-        return replace(noisy, quaternions=_unit(noisy.quaternions))
-
-
-def _arrays(g: Gaussians) -> tuple[np.ndarray, ...]:
-    return g.means, g.log_scales, g.quaternions, g.opacity_logits, g.sh
-
-
-def make_sequence(source: Gaussians, options: SequenceOptions) -> tuple[list[Segment], Quantizer]:
-    """Segments of one made-up sequence, pruned by the UV map at each key, and their quantizer."""
-    rng = np.random.default_rng(options.seed)
-    around = _surroundings(source, options.still, rng)
-    near = np.argsort(np.abs(np.arctan2(around.means[:, 1], around.means[:, 0]) - 0.5))[: options.restless]
-    is_still = np.ones(len(around), bool)
-    is_still[near] = False
-    actor = _placed(_pick(source, rng.permutation(len(source))[: options.actor]), 1.8, np.zeros(3))
-    still, restless = _pick(around, np.flatnonzero(is_still)), _pick(around, near)
-    quantizer = _quantizer(_join([still, restless, _posed(actor, 0)]))
-    segments = []
-    for number in range(options.keyframes):
-        first = number * options.frames
-        segments.append(_segment(first, still, restless, actor, quantizer, options, rng))
-    return segments, quantizer
-
-
-def _segment(
-    first: int,
-    still: Gaussians,
-    restless: Gaussians,
-    actor: Gaussians,
-    quantizer: Quantizer,
-    options: SequenceOptions,
-    rng: np.random.Generator,
-) -> Segment:
-    key = _join([still, restless, _posed(actor, first / 30)])
-    kept = assign_slots(key.means, key.opacity_logits, quantizer.centre, options=UvOptions()).kept
-    dynamic = np.arange(len(key)) >= len(still)
-    noise = _FitNoise(_pick(key, dynamic), options.noise, rng)
-    frames = []
-    for frame in range(first + 1, first + options.frames):
-        noise.step()
-        frames.append(quantizer.encode(noise.on(_join([restless, _posed(actor, frame / 30)])))[kept[dynamic]])
-    count = int((dynamic & kept).sum())
-    xyz = np.array([f.xyz for f in frames], np.uint16).reshape(-1, count, 3)
-    attributes = np.array([f.attributes for f in frames], np.uint8).reshape(len(frames), count, -1)
-    return Segment(first, quantizer.encode(key)[kept], dynamic[kept], xyz, attributes)
-
-
-def _quantizer(key: Gaussians) -> Quantizer:
-    """Ranges with margin from the first frame, centre in the actor."""
-    values = attribute_values(key)
-    low, high = np.percentile(values, [0.02, 99.98], axis=0)
-    low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
-    low[ROTATION], high[ROTATION] = -1, 1
-    low[OPACITY], high[OPACITY] = OPACITY_RANGE
-    return Quantizer(np.zeros(3), 1.0, np.abs(key.means).max(axis=0) * 1.2, low, high, key.sh_degree)
-
-
-# Measurements
-
-
-def measure_scene(segments: Sequence[Path], header: SceneHeader, folder: Path, *, threads: int) -> dict[str, Any]:
+def measure_scene(
+    label: str,
+    segments: Sequence[Path],
+    header: SceneHeader,
+    path: Path,
+    options: EncodeOptions,
+    *,
+    threads: int,
+) -> dict[str, Any]:
     """Write, verify and read one scene file."""
-    path, frames, clock = folder / "scene.mkv", len(header.times_ns), [time.perf_counter()]
+    frames, start = len(header.times_ns), (time.perf_counter(), time.process_time())
     encoded: list[float] = []
 
     def note(done: int, total: int) -> None:
         if done == total // 2:
-            encoded.append(time.perf_counter())
+            encoded.extend((time.perf_counter() - start[0], time.process_time() - start[1]))
 
-    summary = write_scene(path, segments, header, threads=threads, progress=note)
-    clock.append(time.perf_counter())
+    summary = write_scene(path, segments, header, options=options, threads=threads, progress=note)
+    written = time.perf_counter() - start[0]
     with open_scene(path, threads=threads) as scene:
         rows = [segment.rows for segment in scene.index.segments for _ in range(segment.frames)]
         predictions = [p for segment in scene.index.segments for p in segment.predictions]
-        seconds_codes = _seconds(lambda: [scene.codes(frame) for frame in range(frames)])
-        seconds_floats = _seconds(lambda: [scene.gaussians(frame) for frame in range(frames)])
+        cpu = time.process_time()
+        seconds_floats = _seconds(lambda: [len(scene.gaussians(frame)) for frame in range(frames)])
+        cpu = time.process_time() - cpu
+        seconds_codes = _seconds(lambda: [len(scene.codes(frame)) for frame in range(frames)])
         jumps = np.random.default_rng(0).integers(0, frames, 8)
         seconds_random = _seconds(lambda: [scene.codes(int(frame)) for frame in jumps]) / len(jumps)
+        own = [segment.own for segment in scene.index.segments]
     return {
-        "layout": "compact",
+        "layout": label,
+        "tolerance": vars(options.tolerance),
         "bytes": summary.bytes,
         "track_bytes": dict(summary.track_bytes),
         "frames": frames,
         "frames_measured": frames,
         "gaussians_per_frame": float(np.mean(rows)),
         "bits_per_gaussian_and_frame": summary.bytes * 8 / sum(rows),
+        "key_rows_stored": own,
         "frames_by_prediction": {name: predictions.count(k) for k, name in enumerate(("repeat", "previous", "linear"))},
-        "encode_frames_per_second": frames / (encoded[0] - clock[0]),
-        "encode_and_verify_frames_per_second": frames / (clock[1] - clock[0]),
+        "encode_frames_per_second": frames / encoded[0],
+        "encode_cpu_seconds_per_frame": encoded[1] / frames,
+        "encode_and_verify_frames_per_second": frames / written,
         "decode_codes_frames_per_second": frames / seconds_codes,
         "decode_floats_frames_per_second": frames / seconds_floats,
+        "decode_floats_cpu_seconds_per_frame": cpu / frames,
         "random_access_seconds": seconds_random,
     }
 
@@ -248,6 +118,9 @@ def _seconds(work: Any) -> float:
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
+
+
+# The paper's pictures
 
 
 def measure_plain_atlas(
@@ -262,7 +135,7 @@ def measure_plain_atlas(
     channels = len(channel_names(quantizer.sh_degree))
     across = int(np.ceil(np.sqrt(channels)))
     down = -(-channels // across)
-    encoder = Encoder(Track("atlas", width * across, height * down, across * down), threads=threads)
+    encoder = Encoder(Track("atlas", width * across, height * down, across * down))
     total, seconds = 0, 0.0
     sizes: list[int] = []
     rows: list[int] = []
@@ -282,7 +155,7 @@ def measure_plain_atlas(
             seconds += time.perf_counter() - start
             rows.append(int(slots.kept.sum()))
     return {
-        "layout": "plain atlas",
+        "layout": "plain atlas, ffv1",
         "bytes": round(np.mean(sizes) * total),
         "frames": total,
         "frames_measured": len(sizes),
@@ -297,12 +170,110 @@ def _bytes(codes: Codes) -> np.ndarray:
     return np.concatenate([codes.xyz >> 8, codes.xyz & 255, codes.attributes], axis=1).astype(np.uint8)
 
 
+# Other codecs
+
+
+def measure_codecs(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """The pictures of both tracks of a scene file through other codecs, each track as one video."""
+    with open_scene(path) as scene:
+        tracks = [list(_pictures(scene, number)) for number in range(len(scene.index.tracks))]
+        rows = sum(segment.rows * segment.frames for segment in scene.index.segments)
+        frames = len(scene)
+    for name in names:
+        codec, start = CODECS[name], time.perf_counter()
+        try:
+            coded = [_code(codec, pictures) for pictures in tracks]
+        except (av.FFmpegError, ValueError) as error:
+            yield {"layout": f"pictures, {name}", "skipped": str(error)}
+            continue
+        seconds = time.perf_counter() - start
+        exact = all(_comes_back(codec, *pair) for pair in zip(coded, tracks, strict=True))
+        size = sum(len(packet) for packets, _ in coded for packet in packets)
+        yield {
+            "layout": f"pictures, {name}",
+            "exact": exact,
+            "bytes": size,
+            "track_bytes": [sum(map(len, packets)) for packets, _ in coded],
+            "frames": frames,
+            "frames_measured": frames,
+            "bits_per_gaussian_and_frame": size * 8 / rows,
+            "encode_frames_per_second": frames / seconds,
+        }
+
+
+def _pictures(scene: Scene, track: int) -> Iterator[np.ndarray]:
+    """All pictures of a track, in order."""
+    wanted = [address for address in scene._wanted(0, 0, len(scene) - 1) if address.track == track]
+    assert track in (KEY, DYNAMIC)
+    yield from (scene._pictures.picture(address, []) for address in wanted)
+
+
+def _code(codec: Codec, pictures: Sequence[np.ndarray]) -> tuple[list[bytes], bytes | None]:
+    """Packets in coding order, and the stream's own header."""
+    context = av.CodecContext.create(codec.encoder, "w")
+    context.height, context.width = pictures[0].shape
+    context.pix_fmt, context.time_base = codec.pixels, Fraction(1, 30)
+    context.framerate = Fraction(30)
+    context.options = dict(codec.options)
+    packets = []
+    for number, picture in enumerate(pictures):
+        frame = av.VideoFrame.from_ndarray(_framed(picture, codec.pixels), format=codec.pixels)
+        frame.pts, frame.time_base = number, context.time_base
+        packets += context.encode(frame)
+    packets += context.encode(None)
+    return [bytes(packet) for packet in packets], context.extradata
+
+
+def _framed(picture: np.ndarray, pixels: str) -> np.ndarray:
+    """The picture as luma, with chroma of nothing below where the format wants one."""
+    if pixels == "gray":
+        return picture
+    return np.concatenate([picture, np.full((picture.shape[0] // 2, picture.shape[1]), 128, np.uint8)])
+
+
+def _comes_back(codec: Codec, coded: tuple[list[bytes], bytes | None], pictures: Sequence[np.ndarray]) -> bool:
+    packets, header = coded
+    encoder = av.CodecContext.create(codec.encoder, "w").codec
+    names = {"libx264": "h264", "libx265": "hevc", "libvpx-vp9": "vp9", "libsvtav1": "libdav1d"}
+    context = av.CodecContext.create(names.get(codec.encoder, encoder.name), "r")
+    context.extradata = header
+    context.height, context.width = pictures[0].shape
+    frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
+    frames += context.decode(None)
+    height, width = pictures[0].shape
+    found = [frame.to_ndarray()[:height, :width] for frame in frames]
+    return len(found) == len(pictures) and all(map(np.array_equal, found, pictures))
+
+
+# Distortion
+
+
+def measure_renders(lossless: Path, scenes: Sequence[Path], *, frames: int) -> list[float]:
+    """PSNR of each scene's renders against the lossless scene's, decibels, over frames and cameras together."""
+    squares = np.zeros(len(scenes))
+    count = 0
+    with open_scene(lossless) as truth:
+        artist, header = Artist(truth), truth.header
+        names = header.held_out or spread([camera.name for camera in header.cameras], 3)
+        cameras = [camera for camera in header.cameras if camera.name in names]
+        chosen = [(2 * place + 1) * len(truth) // (2 * frames) for place in range(min(frames, len(truth)))]
+        for frame in chosen:
+            expected = [artist.draw(truth.gaussians(frame), camera) for camera in cameras]
+            count += sum(picture.size for picture in expected)
+            for number, path in enumerate(scenes):
+                with open_scene(path) as scene:
+                    gaussians = scene.gaussians(frame)
+                for camera, picture in zip(cameras, expected, strict=True):
+                    squares[number] += float(((artist.draw(gaussians, camera) - picture) ** 2).sum())
+    return [float(10 * np.log10(count / max(square, 1e-12))) for square in squares]
+
+
 def key_entropy(segment: Segment) -> dict[str, float]:
     """Order-0 entropy of each channel of the key, bits: what a codec without context would pay."""
     rows, bits = key_rows(segment.key), {}
     for channel, name in enumerate(channel_names(round(((rows.shape[1] - 13) / 3) ** 0.5) - 1)):
         share = np.bincount(rows[:, channel], minlength=256) / len(rows)
-        bits[name] = float(-(share[share > 0] * np.log2(share[share > 0])).sum())
+        bits[name] = round(float(-(share[share > 0] * np.log2(share[share > 0])).sum()), 3)
     return bits
 
 
@@ -311,43 +282,69 @@ def key_entropy(segment: Segment) -> dict[str, float]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.codec", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--segments", type=Path, nargs="+", help="segment files; without them a sequence is made up")
+    parser.add_argument("--scene", type=Path, help="a lossless scene file")
+    parser.add_argument("--segments", type=Path, nargs="+", help="segment files; without any a sequence is made up")
     parser.add_argument("--quantizer", type=Path, help="JSON of the segments' quantizer")
+    parser.add_argument("--capture", type=Path, help="capture folder of the scene, for PSNR against what was filmed")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--plot", type=Path, help="rate-distortion plot to write, SVG; needs --scene")
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--plain-frames", type=int, default=2, help="frames of plain atlas FFV1 to measure")
+    parser.add_argument("--render-frames", type=int, default=4, help="frames to render for distortion")
+    parser.add_argument("--codecs", nargs="*", default=list(CODECS), choices=list(CODECS))
     for name, default in asdict(SequenceOptions()).items():
         parser.add_argument(f"--{name}", type=type(default), default=default, help="of the made-up sequence")
     options = parser.parse_args(arguments)
     if options.segments and not options.quantizer:
         parser.error("--segments needs --quantizer, the JSON that belongs to them")
+    if options.plot and not options.scene:
+        parser.error("--plot needs --scene, whose cameras render")
     with tempfile.TemporaryDirectory() as folder:
         results = run(options, Path(folder))
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(results, indent=2) + "\n")
+    options.out.write_text(json.dumps(results, indent=1) + "\n")
+    if options.plot:
+        options.plot.write_text(plot(results["rows"]))
     print(table(results["rows"]))
 
 
 def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """All measurements of one command line."""
-    made_up = SequenceOptions(**{name: getattr(options, name) for name in asdict(SequenceOptions())})
-    if options.segments:
-        paths, source = options.segments, "segment files"
-        quantizer = Quantizer.from_json(json.loads(options.quantizer.read_text()))
-    else:
-        paths, quantizer, source = _write_made_up(made_up, folder)
-    frames = sum(len(Segment.load(path)) for path in paths)
-    times = (np.arange(frames) * 10**9 // 30).astype(np.int64)
-    header = SceneHeader(quantizer, times, Fraction(30))
-    rows = [measure_scene(paths, header, folder, threads=options.threads)]
-    if options.plain_frames:
-        rows.append(
-            measure_plain_atlas(paths, quantizer, threads=options.threads, frames_measured=options.plain_frames)
+    paths, header, source = _sequence(options, folder)
+    rows = [
+        measure_scene(
+            f"compact, {quality}",
+            paths,
+            header,
+            folder / f"{quality}.mkv",
+            EncodeOptions(TOLERANCES[quality]),
+            threads=options.threads,
         )
+        for quality in Quality
+    ]
+    files = [folder / f"{quality}.mkv" for quality in Quality]
+    if len(paths) > 1:
+        alone, file = EncodeOptions(reach=1), folder / "alone.mkv"
+        rows.append(measure_scene("compact, no sharing", paths, header, file, alone, threads=options.threads))
+    if header.cameras:
+        for row, decibel in zip(
+            rows[1:], measure_renders(files[0], files[1:], frames=options.render_frames), strict=False
+        ):
+            row["psnr_to_lossless_db"] = decibel
+    if options.capture:
+        for row, path in zip(rows, files, strict=False):
+            row["unseen_cameras"] = _filmed(path, options.capture)
+    if options.plain_frames:
+        plain = measure_plain_atlas(
+            paths, header.quantizer, threads=options.threads, frames_measured=options.plain_frames
+        )
+        rows.append(plain)
+    rows += measure_codecs(files[0], options.codecs)
     first = Segment.load(paths[0])
     return {
         "source": source,
-        "sequence": None if options.segments else asdict(made_up),
+        "command": shlex.join(["python", "-m", "bench.codec", *sys.argv[1:]]),
+        "load": os.getloadavg()[0],
         "gaussians": len(first.key),
         "dynamic": int(first.dynamic.sum()),
         "rows": rows,
@@ -355,28 +352,111 @@ def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     }
 
 
-def _write_made_up(options: SequenceOptions, folder: Path) -> tuple[list[Path], Quantizer, str]:
-    trained = any((DATA / "splats").glob("*.compressed.ply"))
-    rng = np.random.default_rng(options.seed)
-    source = trained_gaussians(DATA / "splats") if trained else made_up_gaussians(250_000, rng)
-    segments, quantizer = make_sequence(source, options)
+def _sequence(options: argparse.Namespace, folder: Path) -> tuple[list[Path], SceneHeader, Any]:
+    """Segment files, what the scene says, and where it is from."""
+    if options.scene:
+        return _unpacked(options.scene, folder)
+    if options.segments:
+        paths, source = options.segments, "segment files"
+        quantizer = Quantizer.from_json(json.loads(options.quantizer.read_text()))
+    else:
+        made_up = SequenceOptions(**{name: getattr(options, name) for name in asdict(SequenceOptions())})
+        gaussians, origin = find_gaussians(made_up.seed)
+        segments, quantizer = make_sequence(gaussians, made_up)
+        paths, source = _saved(segments, folder), {"made up from": origin, **asdict(made_up)}
+    frames = sum(len(Segment.load(path)) for path in paths)
+    return paths, SceneHeader(quantizer, (np.arange(frames) * 10**9 // 30).astype(np.int64), Fraction(30)), source
+
+
+def _unpacked(path: Path, folder: Path) -> tuple[list[Path], SceneHeader, Any]:
+    """The segments of a scene file."""
+    segments = []
+    with open_scene(path) as scene:
+        if not scene.index.tolerance.exact:
+            raise ValueError(f"{path} is lossy; measure on a lossless scene file")
+        for entry in scene.index.segments:
+            frames = [scene.codes(entry.first + step) for step in range(entry.frames)]
+            count, width = entry.dynamic, frames[0].attributes.shape[1]
+            xyz = np.array([frame.xyz[:count] for frame in frames[1:]], np.uint16).reshape(-1, count, 3)
+            attributes = np.array([frame.attributes[:count] for frame in frames[1:]], np.uint8)
+            segments.append(
+                Segment(
+                    entry.first,
+                    frames[0],
+                    np.arange(entry.rows) < count,
+                    xyz,
+                    attributes.reshape(-1, count, width),
+                )
+            )
+        return _saved(segments, folder), scene.header, f"scene file {path.name}"
+
+
+def _saved(segments: Sequence[Segment], folder: Path) -> list[Path]:
     paths = [folder / f"segment{number}.npz" for number in range(len(segments))]
     for path, segment in zip(paths, segments, strict=True):
         segment.save(path)
-    return paths, quantizer, "trained scenes" if trained else "made-up surfaces"
+    return paths
+
+
+def _filmed(path: Path, capture: Path) -> dict[str, float]:
+    """PSNR and SSIM against what cameras filmed that were not fitted."""
+    facts = evaluate_scene(path, capture, None, EvaluateOptions(), lambda *_: None)
+    return {name: facts["mean"][name] for name in ("psnr_db", "ssim")}
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """One line a layout."""
-    lines = [f"{'layout':12} {'MB/30 frames':>13} {'bits/G/frame':>13} {'encode f/s':>11} {'decode f/s':>11}"]
+    lines = [
+        f"{'layout':22} {'MB/30 frames':>12} {'bits/G/frame':>12} {'encode f/s':>10} {'decode f/s':>10} {'PSNR':>6}"
+    ]
     for row in rows:
+        if "skipped" in row:
+            lines.append(f"{row['layout']:22} skipped: {row['skipped']}")
+            continue
         size = row["bytes"] * 30 / row["frames"] / 1e6
-        decode = row.get("decode_floats_frames_per_second", float("nan"))
-        lines.append(
-            f"{row['layout']:12} {size:13.2f} {row['bits_per_gaussian_and_frame']:13.2f} "
-            f"{row['encode_frames_per_second']:11.2f} {decode:11.2f}"
-        )
+        known = [size, row["bits_per_gaussian_and_frame"], row["encode_frames_per_second"]]
+        known += [row.get("decode_floats_frames_per_second", np.nan)]
+        known += [1e3 * row.get(f"{way}_cpu_seconds_per_frame", np.nan) for way in ("encode", "decode_floats")]
+        known += [row.get("psnr_to_lossless_db", np.nan)]
+        exact = "" if row.get("exact", True) else "  NOT EXACT"
+        lines.append(f"{row['layout']:22} " + " ".join(f"{value:13.2f}" for value in known) + exact)
     return "\n".join(lines)
+
+
+def plot(rows: Sequence[dict[str, Any]]) -> str:
+    """Rate against distortion as SVG: size on a logarithmic scale, lossless layouts along the top."""
+    sized = [row for row in rows if "bytes" in row]
+    points = [(row["bytes"] * 30 / row["frames"] / 1e6, row.get("psnr_to_lossless_db"), row["layout"]) for row in sized]
+    known = [decibel for _, decibel, _ in points if decibel]
+    low, high = np.log10([min(p[0] for p in points) * 0.8, max(p[0] for p in points) * 1.3])
+    bottom, top = min(known, default=40) - 2, max(known, default=40) + 6
+    marks = [_axes(low, high, bottom, top)]
+    for number, (size, decibel, label) in enumerate(sorted(points, key=lambda point: (point[1] is None, point[0]))):
+        x = 70 + (np.log10(size) - low) / (high - low) * 820
+        y = 40 if decibel is None else 60 + (top - decibel) / (top - bottom) * 380
+        place = y + 4 if decibel else y + 18 + 16 * (number % 6)
+        marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4"/><text x="{x + 7:.1f}" y="{place:.1f}">{label}</text>')
+    body = "".join(marks)
+    head = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1060 500" font-family="sans-serif" font-size="12">'
+    return f"{head}{body}</svg>\n"
+
+
+def _axes(low: float, high: float, bottom: float, top: float) -> str:
+    parts = ['<rect width="1060" height="500" fill="white"/><path d="M70 40V450H890" fill="none" stroke="black"/>']
+    parts.append(
+        '<text x="480" y="490" text-anchor="middle">MB per 30 frames</text><text x="75" y="30">lossless</text>'
+    )
+    parts.append('<text x="16" y="250" transform="rotate(-90 16 250)" text-anchor="middle">PSNR to lossless, dB</text>')
+    for size in (1, 2, 3, 5, 10, 20, 50, 100, 200, 500):
+        if low <= np.log10(size) <= high:
+            x = 70 + (np.log10(size) - low) / (high - low) * 820
+            parts.append(
+                f'<path d="M{x:.1f} 450v5" stroke="black"/><text x="{x:.1f}" y="468" text-anchor="middle">{size}</text>'
+            )
+    for decibel in range(int(np.ceil(bottom)), int(top) + 1, 2):
+        y = 60 + (top - decibel) / (top - bottom) * 380
+        parts.append(f'<text x="62" y="{y + 4:.1f}" text-anchor="end">{decibel}</text>')
+    return "".join(parts)
 
 
 if __name__ == "__main__":

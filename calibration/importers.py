@@ -1,14 +1,16 @@
-"""Calibrations made elsewhere, read into a `Rig` and written out again.
+"""Calibrations made elsewhere, read into a `Rig`; `calibration.exporters` writes them.
 
-Read: COLMAP models (text, binary), transforms.json (nerfstudio, instant-ngp), caliscope's camera_array.toml, and our
-own rig.json. What each says about axes, pixel centres and units is in docs/calibration.md; after loading everything
-follows `calibration.rig`: OpenCV axes, world to camera, top-left pixel's centre at (0.5, 0.5).
+Read: COLMAP models (text, binary), transforms.json (nerfstudio, instant-ngp), poses_bounds.npy (LLFF, N3DV), intri.yml
+with extri.yml (EasyMocap), caliscope's camera_array.toml, and our own rig.json. What each says about axes, pixel
+centres and units is in docs/calibration.md; after loading everything follows `calibration.rig`: OpenCV axes, world to
+camera, top-left pixel's centre at (0.5, 0.5).
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -45,7 +47,9 @@ def load_rig(path: Path, names: Sequence[str] | None = None) -> Rig:
     """Read a calibration; `names` (of the videos) selects its cameras and sets their order.
 
     `path` is a file, or a folder that holds rig.json, a COLMAP model (there, or under sparse/0, sparse or colmap),
-    transforms.json, or one caliscope .toml; the first of these counts. Cameras that no video needs are left out.
+    transforms.json, poses_bounds.npy, intri.yml with extri.yml, or one caliscope .toml; the first of these counts.
+    Cameras that no video needs are left out. poses_bounds.npy names no cameras: its rows are those of the videos in
+    the order of their names, or, for fewer videos than rows, the row of the number at the end of a video's name.
     Raises FileNotFoundError when nothing is there, and ValueError for an unreadable calibration or for videos
     without a camera.
     """
@@ -54,8 +58,8 @@ def load_rig(path: Path, names: Sequence[str] | None = None) -> Rig:
         raise FileNotFoundError(f"no calibration at {path}")
     file = _find(path) if path.is_dir() else path
     try:
-        views, metric = _read(file)
-    except (KeyError, TypeError, IndexError, struct.error) as problem:
+        views, metric = _read(file, names)
+    except (KeyError, TypeError, IndexError, EOFError, struct.error) as problem:
         raise ValueError(f"{file} is damaged or not a calibration: {type(problem).__name__}: {problem}") from problem
     except ValueError as problem:
         raise ValueError(f"{file}: {problem}") from problem
@@ -64,50 +68,27 @@ def load_rig(path: Path, names: Sequence[str] | None = None) -> Rig:
     return Rig(tuple(_cameras(views, names, file)), str(file), metric)
 
 
-def write_colmap(rig: Rig, folder: Path) -> None:
-    """Write a COLMAP text model without points: one camera and one image `<name>.png` for each camera of the rig.
-
-    COLMAP has no place for colour gains; they are left out.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    lenses, images = (
-        ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"],
-        ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"],
-    )
-    for number, camera in enumerate(rig.cameras, start=1):
-        model, parameters = _colmap_model(camera)
-        pose = (*_quaternion(camera.camera_from_world[:3, :3]), *camera.camera_from_world[:3, 3])
-        lenses.append(f"{number} {model} {camera.width} {camera.height} {_decimals(parameters)}")
-        images += [f"{number} {_decimals(pose)} {number} {camera.name}.png", ""]
-    (folder / "cameras.txt").write_text("\n".join(lenses) + "\n")
-    (folder / "images.txt").write_text("\n".join(images) + "\n")
-    (folder / "points3D.txt").write_text("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n")
-
-
-def write_transforms(rig: Rig, path: Path) -> None:
-    """Write nerfstudio's transforms.json with intrinsics in each frame; gains are left out.
-
-    Raises ValueError for a rational lens model (8 coefficients), which the format cannot hold.
-    """
-    frames = [_transforms_frame(camera) for camera in rig.cameras]
-    path.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1))
-
-
 def _find(folder: Path) -> Path:
     models = [
         folder / sub / f"cameras.{kind}" for sub in (".", "sparse/0", "sparse", "colmap") for kind in ("bin", "txt")
     ]
-    for file in (folder / "rig.json", *models, folder / "transforms.json", *sorted(folder.glob("*.toml"))):
+    others = (folder / name for name in ("transforms.json", "poses_bounds.npy", "intri.yml"))
+    for file in (folder / "rig.json", *models, *others, *sorted(folder.glob("*.toml"))):
         if file.is_file():
             return file
     raise ValueError(
         f"{folder} holds no calibration that we read (rig.json, COLMAP's cameras and images as .bin or .txt, "
-        f"transforms.json, camera_array.toml), only {sorted(entry.name for entry in folder.iterdir())}"
+        "transforms.json, poses_bounds.npy, intri.yml, camera_array.toml), only "
+        f"{sorted(entry.name for entry in folder.iterdir())}"
     )
 
 
-def _read(file: Path) -> tuple[list[_View], bool]:
+def _read(file: Path, names: Sequence[str] | None) -> tuple[list[_View], bool]:
     """The posed pictures of a calibration file, and whether its units are metres."""
+    if file.suffix == ".npy":
+        return _read_poses_bounds(file, names), False
+    if file.suffix in (".yml", ".yaml"):
+        return _read_easymocap(file.with_name(f"intri{file.suffix}"), file.with_name(f"extri{file.suffix}")), False
     if file.suffix == ".toml":
         return _read_caliscope(tomllib.loads(file.read_text())), True
     if file.suffix == ".bin":
@@ -115,7 +96,7 @@ def _read(file: Path) -> tuple[list[_View], bool]:
     if file.suffix == ".txt":
         return _read_colmap_text(file.parent), False
     if file.suffix != ".json":
-        raise ValueError("a calibration is a .json, .toml, .txt or .bin file, or a folder with one")
+        raise ValueError("a calibration is a .json, .toml, .txt, .bin, .npy or .yml file, or a folder with one")
     data = json.loads(file.read_text())
     if "frames" in data:
         return [_transforms_view(data, frame) for frame in data["frames"]], False
@@ -231,24 +212,6 @@ def _rotation(quaternion: Sequence[float]) -> np.ndarray:
     )
 
 
-def _quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    """Unit w x y z with w >= 0: the largest eigenvector of Bar-Itzhack's matrix, sound for every rotation."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    lower = [
-        [a - e - i, 0, 0, 0],
-        [d + b, e - a - i, 0, 0],
-        [g + c, h + f, i - a - e, 0],
-        [h - f, c - g, d - b, a + e + i],
-    ]
-    x, y, z, w = np.linalg.eigh(np.array(lower) / 3)[1][:, -1]
-    sign = -1.0 if w < 0 else 1.0
-    return float(sign * w), float(sign * x), float(sign * y), float(sign * z)
-
-
-def _decimals(values: Iterable[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)  # repr of a float reads back to the same float
-
-
 # COLMAP
 
 
@@ -340,12 +303,6 @@ def _colmap_view(pose: Sequence[float], lens: Camera, picture: str) -> _View:
     return _View(_picture_names(picture), replace(lens, camera_from_world=matrix))
 
 
-def _colmap_model(camera: Camera) -> tuple[str, tuple[float, ...]]:
-    base = (camera.fx, camera.fy, camera.cx, camera.cy)
-    model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}[len(camera.distortion)]
-    return model, (base + camera.distortion + (0.0,) * 8)[: _PARAMETER_COUNTS[model]]
-
-
 # transforms.json
 
 
@@ -379,17 +336,6 @@ def _transforms_intrinsics(values: Mapping[str, Any], picture: str) -> tuple[flo
     return fx, fy, float(values.get("cx", width / 2)), float(values.get("cy", height / 2)), width, height
 
 
-def _transforms_frame(camera: Camera) -> dict[str, Any]:
-    if len(camera.distortion) > 5:
-        raise ValueError(f"camera {camera.name!r}: transforms.json holds no rational lens model; write COLMAP instead")
-    pose = np.linalg.inv(camera.camera_from_world) @ _OPENCV_FROM_OPENGL
-    lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False))
-    return {
-        "file_path": f"images/{camera.name}.png", "w": camera.width, "h": camera.height, "fl_x": camera.fx,
-        "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, **lens, "transform_matrix": pose.tolist(),
-    }  # fmt: skip
-
-
 # caliscope
 
 
@@ -416,3 +362,91 @@ def _caliscope_view(table: Mapping[str, Any]) -> _View:
         _pose(rotation, table["translation"], f"camera {number}"), _lens(np.ravel(table["distortions"])),
     )  # fmt: skip
     return _View((f"cam_{number}", f"port_{number}", f"cam{number}", str(number)), camera)
+
+
+# LLFF and N3DV
+
+
+def _read_poses_bounds(file: Path, names: Sequence[str] | None) -> list[_View]:
+    rows = np.load(file, allow_pickle=False)
+    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
+        raise ValueError(f"poses_bounds.npy holds a row of 17 finite numbers for each camera, but is {rows.shape}")
+    of_row = _names_of_rows(len(rows), names)
+    return [_View((of_row[number],), _llff_camera(row)) for number, row in enumerate(rows)]
+
+
+def _names_of_rows(count: int, names: Sequence[str] | None) -> list[str]:
+    """The camera of each row: by order where numbers agree, else by the number at the end of the name."""
+    if names is None:
+        return [f"cam{number:02d}" for number in range(count)]
+    if len(names) == count:
+        return sorted(names)
+    numbers = {int(match[0]): name for name in names if (match := re.search(r"\d+$", name))}
+    if len(numbers) != len(names) or max(numbers, default=0) >= count:
+        raise ValueError(
+            f"it has {count} rows, which belong to the videos in the order of their names, but there are "
+            f"{len(names)} videos; add the missing ones, or number all from 0 to {count - 1}"
+        )
+    return [numbers.get(number, f"row {number}") for number in range(count)]
+
+
+def _llff_camera(row: np.ndarray) -> Camera:
+    """Columns are the axes down, right, back, the centre, and height, width, focal length; near and far are left."""
+    pose = row[:15].astype(np.float64).reshape(3, 5)
+    down, right, back, centre = pose.T[:4]
+    height, width, focal = (float(value) for value in pose[:, 4])
+    if height != round(height) or width != round(width):
+        raise ValueError(f"pictures are whole pixels in size, but a row says {width} x {height}")
+    rotation = np.stack([right, down, -back])
+    matrix = _pose(rotation, -rotation @ centre, "poses_bounds.npy")
+    return Camera("", int(width), int(height), focal, focal, width / 2, height / 2, matrix)
+
+
+# EasyMocap
+
+
+def _read_easymocap(intri: Path, extri: Path) -> list[_View]:
+    lenses, poses = _storage(intri), _storage(extri)
+    listed = lenses.getNode("names")
+    names = [listed.at(index).string() for index in range(listed.size())] if listed.isSeq() else []
+    if not names:
+        raise ValueError("intri.yml must list its cameras under names")
+    return [_easymocap_view(name, lenses, poses) for name in names]
+
+
+def _storage(path: Path) -> cv2.FileStorage:
+    if not path.exists():
+        raise FileNotFoundError(f"an EasyMocap calibration is intri.yml and extri.yml side by side, but no {path}")
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError):  # OpenCV's bindings wrap the parser's error in a SystemError that says nothing
+        storage = None
+    if storage is None or not storage.isOpened():
+        raise ValueError(f"{path.name} is no YAML file of OpenCV")
+    return storage
+
+
+def _easymocap_view(name: str, lenses: cv2.FileStorage, poses: cv2.FileStorage) -> _View:
+    matrix = _storage_matrix(lenses, f"K_{name}", (3, 3))
+    rotation = poses.getNode(f"Rot_{name}").mat()
+    if rotation is None:
+        rotation = cv2.Rodrigues(_storage_matrix(poses, f"R_{name}", (3, 1)))[0]
+    shift = _storage_matrix(poses, f"T_{name}", (3, 1))
+    lens = lenses.getNode(f"dist_{name}").mat()
+    height, width = (lenses.getNode(f"{axis}_{name}").real() for axis in "HW")
+    if not (height >= 1 and width >= 1):
+        raise ValueError(f"intri.yml must give camera {name!r} its picture size, as H_{name}: 1080 and W_{name}: 1920")
+    # OpenCV calibrates with the top-left pixel's centre at (0, 0), half a pixel from ours.
+    camera = Camera(
+        "", round(width), round(height), matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5,
+        _pose(rotation, shift[:, 0], f"camera {name!r}"), _lens(() if lens is None else np.ravel(lens)),
+    )  # fmt: skip
+    return _View((name,), camera)
+
+
+def _storage_matrix(storage: cv2.FileStorage, key: str, shape: tuple[int, int]) -> np.ndarray:
+    """float64 of this shape; a row stands for a column too."""
+    found = storage.getNode(key).mat()
+    if found is None or found.size != shape[0] * shape[1]:
+        raise ValueError(f"{key} must be a matrix of {shape[0]} x {shape[1]} numbers")
+    return np.asarray(found, dtype=np.float64).reshape(shape)

@@ -37,12 +37,13 @@ from packuv.start import (
     find_bounds,
     first_gaussians,
     hull_points,
+    in_hull,
     neighbour_distance,
     no_points,
     round_gaussians,
 )
 
-VERSION = 2
+VERSION = 3
 """Raised with every change that alters what a fit returns"""
 
 DEAD_CODE = 1
@@ -127,13 +128,15 @@ def fit_next(
     instant: int,
     *,
     masks: Sequence[np.ndarray | None],
+    motion: MotionOptions,
     options: FitOptions,
     progress: Progress | None = None,
 ) -> KeyState:
     """Fit a keyframe from a neighbouring one, later or earlier.
 
     `masks` tell, per camera of `views`, what differs between the two instants, bool [H, W] (None: unknown, the whole
-    picture may). Gaussians that touch no mask keep every code. New ones are born where the masks meet.
+    picture may). Gaussians that touch no mask keep every code. What stood before the background
+    and has gone is dropped, and new Gaussians are born in the hull of what stands there now.
     """
     started = time.monotonic()
     bounds, quantizer = previous.bounds, previous.quantizer
@@ -144,11 +147,15 @@ def fit_next(
     if not any(mask is None or mask.any() for mask in masks):
         return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, 0.0, solver))
     shots = _shots(views, instant, masks)
-    moving = _labels(model.gaussians, quantizer, views, masks, bounds, options)
-    solver.free(moving)
-    born = _hull_gaussians(views, instant, masks, bounds, options, rng)
-    room = max(0, options.density.cap - len(model))
-    solver.append(rows_of(born, slice(0, room)))
+    stills = find_background(views, options.background) if options.background.iteration_share else []
+    before, after = (_before_background(views, i, stills, motion) for i in (previous.instant, instant))
+    gone = _inside(model.gaussians, views, before, bounds, options)
+    gone &= ~_inside(model.gaussians, views, after, bounds, options)
+    solver.keep(~gone)
+    solver.free(_labels(model.gaussians, quantizer, views, masks, bounds, options))
+    seen = [mask if alone is None else alone for alone, mask in zip(after, masks, strict=True)]
+    born = _hull_gaussians(views, instant, seen, bounds, options, rng)
+    solver.append(rows_of(born, slice(0, max(0, options.density.cap - len(model)))))
     shots = _tiled(shots, masks, solver, views)
     loss = solver.run(shots, options.key_iterations, of=options.key_iterations, dense=True,
                       ticks=Ticks(progress, options.key_iterations))  # fmt: skip
@@ -224,6 +231,21 @@ def _before_background(
         pixels = views.pixels(still.camera, instant)
         masks[still.camera] = None if pixels is None else difference(still.pixels, pixels, motion)
     return masks
+
+
+def _inside(
+    gaussians: Gaussians,
+    views: Views,
+    masks: Sequence[np.ndarray | None],
+    bounds: Bounds,
+    options: FitOptions,
+) -> np.ndarray:
+    """Gaussians in the hull of the masks, bool [N]; none if too few cameras have one."""
+    seeing = [(camera, mask) for camera, mask in zip(views.cameras, masks, strict=True) if mask is not None]
+    if len(seeing) < min(options.start.min_views, len(views.cameras)):
+        return np.zeros(len(gaussians), bool)
+    cameras, known = [pair[0] for pair in seeing], [pair[1] for pair in seeing]
+    return in_hull(gaussians.means.astype(np.float64), cameras, known, bounds=bounds, options=options.start)
 
 
 def _surface(shots: Sequence[Shot], points: Points | None, bounds: Bounds, options: FitOptions) -> Points:

@@ -19,6 +19,8 @@ import numpy as np
 TIME_BASE = Fraction(1, 1000)
 MAGIC = b"\x1a\x45\xdf\xa3"
 """First bytes of every EBML file."""
+BLOCK_HEADER = 64
+"""A block's own fields before its packet are never longer, bytes."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Track:
     width: int
     height: int
     slices: int
-    """FFV1 slices of a picture, coded on their own; one a plane suits a mosaic"""
+    """FFV1 slices of a picture, coded on their own"""
 
 
 @dataclass(frozen=True)
@@ -44,14 +46,13 @@ class Packet:
 
 
 class Encoder:
-    """Codes the pictures of one track. The bytes do not depend on `threads` (0: one per core)."""
+    """Codes the pictures of one track, on the calling thread."""
 
-    def __init__(self, track: Track, *, threads: int = 0) -> None:
+    def __init__(self, track: Track) -> None:
         self._context = av.CodecContext.create("ffv1", "w")
         assert isinstance(self._context, av.VideoCodecContext)
         _configure(self._context, track)
-        self._context.thread_type = "SLICE"
-        self._context.thread_count = threads
+        self._context.thread_count = 1
         self._track = track
 
     def encode(self, picture: np.ndarray) -> bytes:
@@ -68,13 +69,38 @@ class Encoder:
         return bytes(packets[0])
 
 
+class Decoder:
+    """Decodes the pictures of one track, on the calling thread."""
+
+    def __init__(self, track: Track, extradata: bytes | None) -> None:
+        self._track = track
+        self._context = av.CodecContext.create("ffv1", "r")
+        assert isinstance(self._context, av.VideoCodecContext)
+        self._context.extradata = extradata
+        self._context.width, self._context.height = track.width, track.height
+        self._context.thread_count = 1
+
+    def decode(self, data: bytes) -> np.ndarray:
+        """The picture of a packet, uint8 [height, width]; raises ValueError for bytes that are none.
+
+        FFmpeg hides failed slice checksums; check the bytes first.
+        """
+        try:
+            frames = self._context.decode(av.Packet(data))
+        except av.FFmpegError as error:
+            raise ValueError(f"a packet of track {self._track.name!r} does not decode ({error.strerror})") from None
+        if len(frames) != 1 or frames[0].format.name != "gray":
+            raise ValueError(f"track {self._track.name!r} is not one of 8-bit grey FFV1 pictures")
+        return frames[0].to_ndarray()
+
+
 def _configure(context: av.VideoCodecContext, track: Track) -> None:
     context.width, context.height, context.pix_fmt = track.width, track.height, "gray"
     context.time_base = TIME_BASE
     context.options = {
         "level": "3",
         "coder": "1",
-        "context": "0",  # the larger model is 2 % larger on keys and 3 % on residuals, which start anew each picture
+        "context": "0",  # the larger model is 2 to 4 % larger on keys and residuals, which start anew each picture
         "slices": str(track.slices),
         "slicecrc": "1",
         "g": "1",
@@ -143,15 +169,22 @@ class FoundPacket:
     position: int
     """Offset of the block that holds it, bytes from the start of the file"""
 
+    def span(self, path: Path) -> tuple[int, int]:
+        """Where exactly the packet's bytes lie in the file, half-open."""
+        with path.open("rb") as file:
+            file.seek(self.position)
+            before = max(0, file.read(BLOCK_HEADER + len(self.data)).find(self.data))
+        return self.position + before, self.position + before + len(self.data)
+
 
 class Reader:
-    """Packets by track and time, pictures by decoding them; one reader for one thread.
+    """Packets by track and time; one reader for one thread.
 
     Raises FileNotFoundError for a missing file, and ValueError for one that is not Matroska, is cut short, or holds no
     such packet.
     """
 
-    def __init__(self, path: Path, *, threads: int = 0) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = Path(path)
         with self._path.open("rb") as file:
             if file.read(4) != MAGIC:
@@ -160,14 +193,16 @@ class Reader:
             self._container = av.open(str(path), format="matroska", metadata_errors="replace")
         except av.FFmpegError as error:
             raise ValueError(f"{path}: its Matroska header is damaged or cut short ({error.strerror})") from None
-        self._decoders = [stream.codec_context for stream in self._container.streams.video]
-        for number, decoder in enumerate(self._decoders):
-            if decoder is None or decoder.name != "ffv1":
+        for number, stream in enumerate(self._container.streams.video):
+            if stream.codec_context is None or stream.codec_context.name != "ffv1":
                 self._container.close()
                 raise ValueError(f"{path}: video track {number} must be FFV1; the file is damaged or no scene")
-            decoder.thread_type = "SLICE"  # no delay: one packet in, one picture out
-            decoder.thread_count = threads
+        self._extradata = [stream.codec_context.extradata for stream in self._container.streams.video]
         self._packets: Iterator[av.Packet] = self._container.demux(*self._container.streams.video)
+
+    def decoder(self, number: int, track: Track) -> Decoder:
+        """A new decoder for a track of the file; decoders may work at the same time, each on one thread."""
+        return Decoder(track, self._extradata[number])
 
     def close(self) -> None:
         self._container.close()
@@ -193,21 +228,6 @@ class Reader:
                 "the file is damaged or cut short"
             )
         return found
-
-    def decode(self, track: int, data: bytes) -> np.ndarray:
-        """The picture of a packet, uint8 [height, width].
-
-        FFmpeg hides failed slice checksums; check the bytes first.
-        """
-        try:
-            frames = self._decoders[track].decode(av.Packet(data))
-        except av.FFmpegError as error:
-            raise ValueError(
-                f"{self._path}: a packet of track {self.tracks[track]!r} does not decode ({error.strerror})"
-            ) from None
-        if len(frames) != 1 or frames[0].format.name != "gray":
-            raise ValueError(f"{self._path}: track {self.tracks[track]!r} is not one of 8-bit grey FFV1 pictures")
-        return frames[0].to_ndarray()
 
     def _scan(self, track: int, time_ms: int, *, first_only: bool) -> FoundPacket | None:
         """Look for a packet from here on, at the next one only or until the track's time has passed."""

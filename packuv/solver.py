@@ -69,7 +69,7 @@ class FitOptions:
     """Factor on the means' rate inside segments: the lifted motion is only nearly right"""
     spare: int = 1500
     """Rows per segment that are empty at its keyframe, for what comes into view"""
-    key_births: int = 4000
+    key_births: int = 10_000
     """Gaussians born inside the hull of what changed since the last keyframe"""
     births_share: float = 0.05
     """Of the moving rows, how many empty ones may come alive in one pass"""

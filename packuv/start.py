@@ -180,25 +180,35 @@ def hull_points(
     count: int,
     rng: np.random.Generator,
 ) -> Points:
-    """At most `count` random points that fall into the mask of nearly every camera that sees them.
-
-    Points are drawn along the rays of masked pixels, within the volume. One camera in five may disagree: a mask can
-    miss what has the colour of its background.
-    """
-    needed = min(options.min_views, len(cameras))
+    """At most `count` random points in the hull of the masks, drawn along the rays of masked pixels."""
     found = np.empty((0, 3))
     for _ in range(_ROUNDS):
         xyz = _masked_rays(cameras, masks, 8 * count, bounds, options, rng)
-        views, inside = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
-        for camera, mask in zip(cameras, masks, strict=True):
-            seen, rows, columns = pixels_of(camera, xyz, bounds.near)
-            views += seen
-            inside[seen] += mask[rows, columns]
-        found = np.concatenate([found, xyz[(views >= needed) & (inside >= 0.8 * views)]])
+        found = np.concatenate([found, xyz[in_hull(xyz, cameras, masks, bounds=bounds, options=options)]])
         if len(found) >= count or not len(xyz):
             break
     rgb, _ = seen_colours(cameras, pictures, found[:count], bounds.near)
     return Points(found[:count], rgb)
+
+
+def in_hull(
+    xyz: np.ndarray,  # [N, 3], world
+    cameras: Sequence[PinholeCamera],
+    masks: Sequence[np.ndarray],  # bool [H, W]
+    *,
+    bounds: Bounds,
+    options: StartOptions,
+) -> np.ndarray:
+    """Which points fall into the mask of nearly every camera that sees them, and are seen by enough: bool [N].
+
+    One camera in five may disagree: a mask can miss what has the colour of its background.
+    """
+    views, inside = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
+    for camera, mask in zip(cameras, masks, strict=True):
+        seen, rows, columns = pixels_of(camera, xyz, bounds.near)
+        views += seen
+        inside[seen] += mask[rows, columns]
+    return np.asarray((views >= min(options.min_views, len(cameras))) & (inside >= 0.8 * views))
 
 
 def _masked_rays(

@@ -1,10 +1,9 @@
 """What a scene file stores of each segment, as plain pictures of bytes (layout `compact`).
 
-A row (one Gaussian) has 6 + A channels: the high and low bytes of its position, then its 8-bit attributes. Each
-channel is a plane, the planes tile one picture (a mosaic), and row i of a segment has the same cell in every plane.
-The key picture holds all rows of the first frame; for later frames a residual picture holds what changed in the
-dynamic rows, modulo 2^16 or 2^8, so that adding it gives back the very integers. docs/scene-format.md is the
-specification.
+A row (one Gaussian) has 6 + A channels: the high and low bytes of its position, then its 8-bit attributes. The key
+holds rows as they are; for later frames a residual picture holds the dynamic rows that changed, and what to add to
+them, modulo 2^16 or 2^8, so that the very integers come back. A tolerance makes residuals coarser; prediction starts
+from what the reader has, so errors do not add up. docs/scene-format.md is the specification.
 """
 
 from __future__ import annotations
@@ -12,23 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numba
 import numpy as np
 
+from packuv.mosaic import NEUTRAL
 from packuv.quantize import DC, OPACITY, Codes
 from packuv.segment import Segment
 
-BLOCK = 32
-"""Side of the square blocks that a Hilbert curve fills with 1,024 neighbouring rows."""
 DC_START = DC.start
 """As a plain number for the compiled loops."""
 POSITION_CHANNELS = 6
 """High bytes of x y z, then low bytes: channels before the attributes."""
-NEUTRAL = 128
-"""Value of a cell that holds no row, and of a residual of nothing."""
-
+GONE = -NEUTRAL
+"""With a tolerance, the opacity residual of a row that disappears."""
 REPEAT, PREVIOUS, LINEAR = 0, 1, 2
 """How a frame's positions are predicted: nothing changed and no picture is stored; as the last frame; moving on."""
 
@@ -40,42 +36,7 @@ def channel_names(sh_degree: int) -> tuple[str, ...]:
     return (*fixed, "rotation_x", "rotation_y", "rotation_z", "opacity", *sh)
 
 
-# Order of rows
-
-
-def morton_codes(xyz: np.ndarray) -> np.ndarray:
-    """Place of positions uint16 [N, 3] on the 3D Morton curve, uint64 [N]; bit 3 b + a is bit b of axis a."""
-    spread = xyz.astype(np.uint64)
-    for shift, mask in ((32, 0xFFFF00000000FFFF), (16, 0x00FF0000FF0000FF), (8, 0xF00F00F00F00F00F)):
-        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-    for shift, mask in ((4, 0x30C30C30C30C30C3), (2, 0x9249249249249249)):
-        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-    return spread[:, 0] | spread[:, 1] << np.uint64(1) | spread[:, 2] << np.uint64(2)
-
-
-def storage_order(segment: Segment) -> np.ndarray:
-    """Row of the segment that each stored row holds, int64 [N].
-
-    The D dynamic rows come first, so that no mask is stored and a frame changes one contiguous part; each part runs
-    along the Morton curve of its key positions, and ties keep their order.
-    """
-    code = morton_codes(segment.key.xyz) | (~segment.dynamic).astype(np.uint64) << np.uint64(63)
-    return np.argsort(code, kind="stable")
-
-
-def in_storage_order(segment: Segment) -> Segment:
-    """The same segment with its rows as a scene file stores and returns them."""
-    order = storage_order(segment)
-    place = np.cumsum(segment.dynamic) - 1  # [N]: dynamic row -> its place in segment.xyz
-    count = int(segment.dynamic.sum())
-    moving = place[order[:count]]
-    return Segment(
-        segment.first,
-        segment.key[order],
-        np.arange(len(order)) < count,
-        segment.xyz[:, moving],
-        segment.attributes[:, moving],
-    )
+# Absent rows
 
 
 def hold_absent(segment: Segment) -> Segment:
@@ -97,107 +58,6 @@ def hold_absent(segment: Segment) -> Segment:
     key = Codes(segment.key.xyz.copy(), segment.key.attributes.copy())
     key.xyz[segment.dynamic], key.attributes[segment.dynamic] = xyz[0], attributes[0]
     return Segment(segment.first, key, segment.dynamic, xyz[1:], attributes[1:])
-
-
-# Pictures
-
-
-@dataclass(frozen=True)
-class Mosaic:
-    """How planes tile a picture, and where row i lies in a plane."""
-
-    channels: tuple[int, ...]
-    """The channel that each plane holds, planes from left to right, then top to bottom"""
-    channel_count: int
-    """Number of channels of a row; those without a plane are constant"""
-    blocks_across: int
-    """Size of a plane, in blocks of BLOCK x BLOCK cells"""
-    blocks_down: int
-
-    @classmethod
-    def of(cls, capacity: int, channels: tuple[int, ...], channel_count: int) -> Mosaic:
-        """The mosaic of nearly square planes that holds `capacity` rows."""
-        blocks = max(1, -(-capacity // BLOCK**2))
-        across = int(np.ceil(np.sqrt(blocks)))
-        return cls(channels, channel_count, across, -(-blocks // across))
-
-    @cached_property
-    def grid(self) -> tuple[int, int]:
-        """Planes across and down: the smallest grid that FFV1 can cut into one slice a plane."""
-        shapes: dict[int, tuple[int, int]] = {}
-        for down in range(2, 33):
-            for across in range(down, 2 * down + 1):
-                shapes.setdefault(across * down, (across, down))
-        return shapes[min(count for count in shapes if count >= len(self.channels))]
-
-    @property
-    def capacity(self) -> int:
-        """Number of rows that fit."""
-        return self.blocks_across * self.blocks_down * BLOCK**2
-
-    @property
-    def width(self) -> int:
-        return self.grid[0] * self.blocks_across * BLOCK
-
-    @property
-    def height(self) -> int:
-        return self.grid[1] * self.blocks_down * BLOCK
-
-    @cached_property
-    def corners(self) -> np.ndarray:
-        """Flat picture index of the first cell of each channel's plane, int64 [channels]; -1 without a plane."""
-        corners = np.full(self.channel_count, -1, np.int64)
-        down, across = np.divmod(np.arange(len(self.channels)), self.grid[0])
-        corners[list(self.channels)] = (down * self.blocks_down * self.width + across * self.blocks_across) * BLOCK
-        return corners
-
-    @cached_property
-    def cells(self) -> np.ndarray:
-        """Flat picture index of each row, relative to its plane's corner, int64 [capacity].
-
-        Blocks run in a serpentine from the top, a Hilbert curve fills each block.
-        """
-        row = np.arange(self.capacity)
-        block_y, block_x = np.divmod(row // BLOCK**2, self.blocks_across)
-        x, y = hilbert(row % BLOCK**2)
-        backwards = block_y % 2 == 1
-        block_x = np.where(backwards, self.blocks_across - 1 - block_x, block_x)
-        x = np.where(backwards, BLOCK - 1 - x, x)
-        return (block_y * BLOCK + y) * self.width + block_x * BLOCK + x
-
-    def blank(self) -> np.ndarray:
-        """A picture without rows, uint8 [height, width]."""
-        return np.full((self.height, self.width), NEUTRAL, np.uint8)
-
-    def draw(self, rows: np.ndarray) -> np.ndarray:
-        """The picture of rows uint8 [n, channels]."""
-        picture = self.blank()
-        flat, cells = picture.reshape(-1), self.cells[: len(rows)]
-        for channel in self.channels:
-            flat[self.corners[channel] + cells] = rows[:, channel]
-        return picture
-
-    def read(self, picture: np.ndarray, constants: np.ndarray, count: int) -> np.ndarray:
-        """Rows uint8 [count, channels] of a picture; `constants` uint8 [channels] stand for missing planes."""
-        rows = np.empty((count, self.channel_count), np.uint8)
-        rows[:] = constants
-        flat, cells = picture.reshape(-1), self.cells[:count]
-        for channel in self.channels:
-            rows[:, channel] = flat[self.corners[channel] + cells]
-        return rows
-
-
-def hilbert(distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x and y of points along the Hilbert curve of a BLOCK x BLOCK square, from (0, 0) to (BLOCK - 1, 0)."""
-    x, y, rest, side = np.zeros_like(distance), np.zeros_like(distance), distance, 1
-    while side < BLOCK:
-        right = rest // 2 & 1
-        below = (rest ^ right) & 1
-        flip = (below == 0) & (right == 1)
-        x, y = np.where(flip, side - 1 - x, x), np.where(flip, side - 1 - y, y)
-        x, y = np.where(below == 0, y, x), np.where(below == 0, x, y)
-        x, y, rest, side = x + side * right, y + side * below, rest // 4, side * 2
-    return x, y
 
 
 # The key frame
@@ -235,6 +95,32 @@ def _colours_to_differences(rows: np.ndarray) -> None:
 
 
 @dataclass(frozen=True)
+class Tolerance:
+    """By how much a frame after its key may differ from what was fitted; keys never differ."""
+
+    position: int = 0
+    """Largest error of a coordinate, steps of its 16-bit scale"""
+    attribute: int = 0
+    """Largest error of every other code, which has 8 bits; presence is always exact"""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.position <= 8192 or not 0 <= self.attribute <= 32:
+            raise ValueError(
+                f"a tolerance must be 0 to 8192 for positions and 0 to 32 for attributes, but is {self.position} and "
+                f"{self.attribute}"
+            )
+
+    @property
+    def exact(self) -> bool:
+        return self.position == self.attribute == 0
+
+    @property
+    def steps(self) -> tuple[int, int]:
+        """What a residual of one stands for in positions and attributes: rounding to it errs by the tolerance."""
+        return 2 * self.position + 1, 2 * self.attribute + 1
+
+
+@dataclass(frozen=True)
 class Change:
     """One frame after the key, as it is stored."""
 
@@ -242,59 +128,10 @@ class Change:
     """REPEAT, PREVIOUS or LINEAR"""
     differences: bool
     """Whether red and blue residuals are stored as differences to green's"""
-    rows: np.ndarray | None
-    """Residuals uint8 [D, channels] around 128; None for REPEAT"""
-
-
-def changes(stored: Segment) -> Iterator[Change]:
-    """The frames after the key of a segment in storage order, each predicted in the way that costs least."""
-    count = int(stored.dynamic.sum())
-    last, velocity = stored.key[:count], np.zeros((count, 3), np.uint16)
-    for xyz, attributes in zip(stored.xyz, stored.attributes, strict=True):
-        now = Codes(xyz, attributes)
-        if np.array_equal(now.xyz, last.xyz) and np.array_equal(now.attributes, last.attributes):
-            yield Change(REPEAT, False, None)
-        else:
-            yield _cheapest(now, last, velocity)
-        present = (now.attributes[:, OPACITY] > 0) & (last.attributes[:, OPACITY] > 0)
-        velocity = np.where(present[:, None], now.xyz - last.xyz, np.uint16(0))
-        last = now
-
-
-def _cheapest(now: Codes, last: Codes, velocity: np.ndarray) -> Change:
-    """Compare both position predictions and both colour forms by order-0 entropy."""
-    step = now.xyz - last.xyz
-    present = now.attributes[:, OPACITY, None] > 0
-    positions = [_position_bytes(step), _position_bytes(step - np.where(present, velocity, np.uint16(0)))]
-    linear = entropy_bits(positions[1]) < entropy_bits(positions[0])
-    colours = now.attributes - last.attributes + np.uint8(NEUTRAL)
-    plain = np.concatenate([positions[linear], colours], axis=1)
-    coupled = plain.copy()
-    _colours_to_differences(coupled)
-    differences = entropy_bits(_colours(coupled)) < entropy_bits(_colours(plain))
-    return Change(LINEAR if linear else PREVIOUS, differences, coupled if differences else plain)
-
-
-def _position_bytes(residual: np.ndarray) -> np.ndarray:
-    """High bytes, then low bytes of uint16 [n, 3], both around 128."""
-    biased = residual + np.uint16(NEUTRAL * 257)
-    return np.concatenate([biased >> 8, biased & 255], axis=1).astype(np.uint8)
-
-
-def entropy_bits(rows: np.ndarray) -> float:
-    """Bits that an ideal coder without context spends on bytes [n, ...], each column with its own statistics."""
-    counts = _histograms(rows.reshape(len(rows), math.prod(rows.shape[1:])))
-    return float((counts * np.log2(max(1, len(rows)) / np.maximum(counts, 1))).sum())
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _histograms(rows):
-    """Counts of each byte in each column, float64 [columns, 256]."""
-    counts = np.zeros((rows.shape[1], 256))
-    for i in range(rows.shape[0]):
-        for k in range(rows.shape[1]):
-            counts[k, rows[i, k]] += 1
-    return counts
+    toggled: np.ndarray
+    """uint8 [D]: 1 where a row is stored in this frame but not in the last one with a picture, or the reverse"""
+    rows: np.ndarray
+    """Residuals uint8 [stored rows, channels] around 128"""
 
 
 class Playback:
@@ -303,50 +140,174 @@ class Playback:
     `codes` is changed in place by every `advance`; copy what you keep.
     """
 
-    def __init__(self, key: Codes, dynamic: int) -> None:
+    def __init__(self, key: Codes, dynamic: int, tolerance: Tolerance) -> None:
         """Start at the key frame, whose first `dynamic` rows may change; `key` is taken over."""
         self.codes = key
-        self._velocity = np.zeros((dynamic, 3), np.uint16)
+        self.velocity = np.zeros((dynamic, 3), np.uint16)
+        self.stored = np.zeros(dynamic, np.uint8)
+        """1 for each row that the last picture held"""
+        self._steps = tolerance.steps
 
-    def advance(self, prediction: int, differences: bool, mosaic: Mosaic, picture: np.ndarray | None) -> None:
-        """Go on by one frame, whose residual picture uint8 [height, width] is absent for REPEAT."""
-        if prediction == REPEAT or picture is None:
-            self._velocity[:] = 0
+    def toggle(self, toggled: np.ndarray) -> int:
+        """Take over which rows come and go in the next picture, uint8 [D]; the number of rows that it holds."""
+        self.stored ^= toggled
+        return int(np.count_nonzero(self.stored))
+
+    def advance(self, prediction: int, differences: bool, rows: np.ndarray) -> None:
+        """Go on by one frame, after `toggle`; the residuals uint8 [stored rows, channels] are not read for REPEAT."""
+        if prediction == REPEAT:
+            self.velocity[:] = 0
             return
-        codes = self.codes
-        _integrate(
-            picture.reshape(-1), mosaic.cells, mosaic.corners, prediction == LINEAR, differences,
-            codes.xyz, codes.attributes, self._velocity,
-        )  # fmt: skip
+        _add(rows, self.stored, prediction == LINEAR, differences, *self._steps,
+             self.codes.xyz, self.codes.attributes, self.velocity)  # fmt: skip
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _integrate(flat, cells, corners, linear, differences, xyz, attributes, velocity):
-    """Add a residual picture to the first len(velocity) rows; the inverse of `changes`."""
-    for i in range(len(velocity)):
-        cell = cells[i]
-        was_present = attributes[i, OPACITY] > 0
-        for k in range(attributes.shape[1]):
-            corner = corners[POSITION_CHANNELS + k]
-            if corner >= 0:
-                attributes[i, k] += flat[corner + cell] - NEUTRAL
-        if differences:
-            for k in range(DC_START, attributes.shape[1], 3):
-                corner = corners[POSITION_CHANNELS + k + 1]
-                if corner >= 0:
-                    green = flat[corner + cell] - NEUTRAL
-                    attributes[i, k] += green
-                    attributes[i, k + 2] += green
+class Coder:
+    """Codes the frames after a key, each predicted from what the reader has, in the way that costs least."""
+
+    def __init__(self, key: Codes, tolerance: Tolerance) -> None:
+        """Start with the D dynamic rows of the key."""
+        self._steps = tolerance.steps
+        self._playback = Playback(Codes(key.xyz.copy(), key.attributes.copy()), len(key), tolerance)
+
+    @property
+    def codes(self) -> Codes:
+        """The D rows as the reader has them; changed in place."""
+        return self._playback.codes
+
+    def change(self, now: Codes) -> Change:
+        """Code the next frame, whose dynamic rows are `now`."""
+        change = self._cheapest(now)
+        self._playback.toggle(change.toggled)
+        self._playback.advance(change.prediction, change.differences, change.rows)
+        return change
+
+    def _cheapest(self, now: Codes) -> Change:
+        """Compare both position predictions and both colour forms by order-0 entropy."""
+        shape = len(now), POSITION_CHANNELS
+        previous, linear = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
+        attributes = np.empty_like(now.attributes)
+        last = self._playback.codes
+        _residuals(now.xyz, now.attributes, last.xyz, last.attributes, self._playback.velocity, *self._steps,
+                   previous, linear, attributes)  # fmt: skip
+        plain = np.concatenate([previous, attributes], axis=1)
+        if (plain == NEUTRAL).all():
+            return Change(REPEAT, False, np.zeros(len(now), np.uint8), plain[:0])
+        moves_on = entropy_bits(linear) < entropy_bits(previous)
+        if moves_on:
+            plain[:, :POSITION_CHANNELS] = linear
+        coupled = plain.copy()
+        _colours_to_differences(coupled)
+        differences = entropy_bits(_colours(coupled)) < entropy_bits(_colours(plain))
+        rows = coupled if differences else plain
+        stored = (rows != NEUTRAL).any(axis=1)
+        toggled = stored.astype(np.uint8) ^ self._playback.stored
+        return Change(LINEAR if moves_on else PREVIOUS, differences, toggled, rows[stored])
+
+
+def changes(stored: Segment, tolerance: Tolerance) -> Iterator[tuple[Change, Codes]]:
+    """The frames after the key of a segment in stored order, and the dynamic rows [D] that a reader then has."""
+    coder = Coder(stored.key[: stored.xyz.shape[1]], tolerance)
+    for xyz, attributes in zip(stored.xyz, stored.attributes, strict=True):
+        yield coder.change(Codes(xyz, attributes)), coder.codes
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _residuals(xyz, attributes, last_xyz, last_attributes, velocity, position_step, attribute_step, previous, linear,
+               others):  # fmt: skip
+    """Bytes of both position residuals [D, 6] and of the attributes' [D, A], around 128."""
+    for i in range(len(xyz)):
         present = attributes[i, OPACITY] > 0
         for axis in range(3):
-            residual = 0
-            if corners[axis] >= 0:
-                residual = (flat[corners[axis] + cell] - NEUTRAL) * 256
-            if corners[axis + 3] >= 0:
-                residual += flat[corners[axis + 3] + cell] - NEUTRAL
-            step = residual + (velocity[i, axis] if linear and present else 0)
-            xyz[i, axis] += step
-            velocity[i, axis] = step if present and was_present else 0
+            now, last = np.int64(xyz[i, axis]), np.int64(last_xyz[i, axis])
+            ahead = (last + velocity[i, axis]) & 65535 if present else last
+            _put_position(previous, i, axis, _rounded(now - last, position_step))
+            _put_position(linear, i, axis, _rounded(now - ahead, position_step))
+        for k in range(attributes.shape[1]):
+            now, last = np.int64(attributes[i, k]), np.int64(last_attributes[i, k])
+            residual = _rounded(now - last, attribute_step)
+            if k == OPACITY and attribute_step > 1:
+                if last == 0:
+                    residual = now
+                elif now == 0:
+                    residual = np.int64(GONE)
+            others[i, k] = (residual + NEUTRAL) & 255
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _put_position(out, i, axis, residual):
+    biased = residual + NEUTRAL * 257
+    out[i, axis] = (biased >> 8) & 255
+    out[i, axis + 3] = biased & 255
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _rounded(difference, step):
+    """Nearest number of whole steps."""
+    if step == 1:
+        return difference
+    count = (abs(difference) + step // 2) // step
+    return count if difference >= 0 else -count
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _add(rows, stored, linear, differences, position_step, attribute_step, xyz, attributes, velocity):
+    """Add the residuals of a frame to the first len(stored) rows; the inverse of `_residuals`."""
+    place = 0
+    change = np.zeros(rows.shape[1], np.int64)
+    for i in range(len(stored)):
+        was_opacity = np.int64(attributes[i, OPACITY])
+        if stored[i]:
+            for k in range(len(change)):
+                change[k] = np.int64(rows[place, k]) - NEUTRAL
+            place += 1
+            if differences:
+                for k in range(POSITION_CHANNELS + DC_START, len(change), 3):
+                    change[k] += change[k + 1]
+                    change[k + 2] += change[k + 1]
+            for k in range(attributes.shape[1]):
+                attributes[i, k] = _moved(attributes[i, k], change[POSITION_CHANNELS + k], attribute_step, 256)
+            if attribute_step > 1:
+                code = was_opacity + attribute_step * change[POSITION_CHANNELS + OPACITY]
+                attributes[i, OPACITY] = min(max(code, 1), 255)
+                if was_opacity == 0:
+                    attributes[i, OPACITY] = change[POSITION_CHANNELS + OPACITY] & 255
+                elif change[POSITION_CHANNELS + OPACITY] == GONE:
+                    attributes[i, OPACITY] = 0
+        else:
+            change[:POSITION_CHANNELS] = 0  # it moves on if the frame does
+        present = attributes[i, OPACITY] > 0
+        for axis in range(3):
+            last = np.int64(xyz[i, axis])
+            expected = (last + velocity[i, axis]) & 65535 if linear and present else last
+            now = _moved(expected, 256 * change[axis] + change[axis + 3], position_step, 65536)
+            xyz[i, axis] = now
+            velocity[i, axis] = now - last if present and was_opacity > 0 else 0
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _moved(value, residual, step, size):
+    """A code 0 to size - 1, a residual of so many steps further: around the end if exact, else at most to the end."""
+    if step == 1:
+        return (np.int64(value) + residual) & (size - 1)
+    residual = ((residual + size // 2) & (size - 1)) - size // 2
+    return min(max(np.int64(value) + step * residual, 0), size - 1)
+
+
+def entropy_bits(rows: np.ndarray) -> float:
+    """Bits that an ideal coder without context spends on bytes [n, ...], each column with its own statistics."""
+    counts = _histograms(rows.reshape(len(rows), math.prod(rows.shape[1:])))
+    return float((counts * np.log2(max(1, len(rows)) / np.maximum(counts, 1))).sum())
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _histograms(rows):
+    """Counts of each byte in each column, float64 [columns, 256]."""
+    counts = np.zeros((rows.shape[1], 256))
+    for i in range(rows.shape[0]):
+        for k in range(rows.shape[1]):
+            counts[k, rows[i, k]] += 1
+    return counts
 
 
 # What need not be stored

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -55,8 +56,16 @@ class _Help(argparse.HelpFormatter):
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one sentence, without the usage text."""
 
+    first_words: tuple[str, ...] = ()
+    """Words of which one must come first; where none does, the first of them is meant"""
+
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, formatter_class=_Help, **settings)
+
+    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def,override]
+        if self.first_words and args and args[0] not in (*self.first_words, "-h", "--help"):
+            args = [self.first_words[0], *args]
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message}; see {self.prog} --help")
@@ -137,11 +146,14 @@ def parser() -> argparse.ArgumentParser:
         _run(command(name, "pipelines.run:command", f"{text} (run --stop-after {name})"), stop=False)
     _scene(command("info", "pipelines.commands:info", "show what a scene file holds"), json=True)
     _verify(command("verify", "pipelines.commands:verify", "check a scene file bit by bit, or the artefacts of a run"))
-    _export(command("export", "pipelines.commands:export", "write one frame for other splat programs"))
+    _export(command("export", "", "write frames, cameras or the atlas of a scene for other programs"))
+    _import(command("import", "pipelines.exchange:import_splats", "turn splat files into a scene file"))
+    _atlas(command("atlas", "pipelines.exchange:atlas", "write the UV atlas of a frame as a picture"))
+    _web(command("web", "pipelines.exchange:web", "write a scene as static files for any web server"))
     _render(command("render", "pipelines.commands:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands:evaluate", "score a scene against a capture"))
     _view(command("view", "pipelines.commands:view", "show a scene in the web browser"))
-    command("doctor", "pipelines.commands:doctor", "tell what this machine has and lacks")
+    command("doctor", "pipelines.doctor:doctor", "tell what this machine has and lacks")
     return top
 
 
@@ -196,11 +208,90 @@ def _verify(command: argparse.ArgumentParser) -> None:
     _json(command)
 
 
-def _export(command: argparse.ArgumentParser) -> None:
+def _export(export: argparse.ArgumentParser) -> None:
+    export.description = "Write frames, cameras or the atlas of a scene for other programs; SCENE alone means frames."
+    export.first_words = ("frames", "cameras", "atlas")  # type: ignore[attr-defined]
+    targets = export.add_subparsers(metavar="WHAT", required=True)
+
+    def target(name: str, function: str, text: str) -> argparse.ArgumentParser:
+        added = targets.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        added.set_defaults(function=f"pipelines.exchange:{function}", command="export")
+        return added
+
+    _export_frames(target("frames", "export_frames", "write frames for other splat programs"))
+    _export_cameras(target("cameras", "export_cameras", "write the cameras of a scene"))
+    _export_atlas(target("atlas", "export_atlas", "write the UV atlas as an ordinary video, one track a triplet"))
+
+
+def _export_frames(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    which = command.add_mutually_exclusive_group(required=True)
+    which.add_argument("--frame", type=int, metavar="N", help="one frame, counted from 0, to a file")
+    which.add_argument("--frames", type=_range, metavar="A:B", help="frames A to B - 1, to a folder of files")
+    command.add_argument(
+        "--format",
+        choices=("ply", "compressed-ply", "spz"),
+        help="standard 3DGS PLY, SuperSplat's compressed PLY, or SPZ (from the name of the output, or ply)",
+    )
+    _output(command, "OUT", "file, or folder for 000000.ply, ...")
+
+
+def _export_cameras(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    formats = ("colmap", "transforms", "poses-bounds")
+    command.add_argument("--to", choices=formats, required=True, help="COLMAP's text model, transforms.json, LLFF's")
+    _output(command, "DIR", "folder to write, new or empty")
+
+
+def _export_atlas(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    codecs = ("ffv1", "x264", "x265", "vp9", "av1", "huffyuv")
+    command.add_argument("--codec", choices=codecs, default="ffv1", help="how the pictures are coded")
+    quality = command.add_mutually_exclusive_group()
+    quality.add_argument(
+        "--lossless", action="store_const", const=None, dest="crf", help="exact, checked (the default)"
+    )
+    quality.add_argument(
+        "--crf", type=int, default=None, metavar="N", help="lossy, on the codec's own scale; positions stay exact"
+    )
+    _uv_map(command)
+    _output(command, "FILE", "Matroska file to write")
+    _json(command)
+
+
+def _import(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "inputs",
+        type=Path,
+        nargs="+",
+        metavar="IN",
+        help="PLY, compressed PLY, SPZ or SOG: one for a still scene, several or a folder for a sequence; "
+        "or an atlas video",
+    )
+    command.add_argument("--fps", type=_rate, default="30", help="frames per second of a sequence, may be a fraction")
+    command.add_argument("--sh-degree", type=int, default=None, metavar="N", help="highest SH degree to keep (all)")
+    command.add_argument("--segment", type=_positive, default=30, metavar="N", help="longest segment, frames")
+    _uv_map(command)
+    command.add_argument("--keep-all", action="store_true", help="no UV map: keep every Gaussian that is drawn")
+    _output(command, "FILE", "scene file to write")
+    _json(command)
+
+
+def _atlas(command: argparse.ArgumentParser) -> None:
     _scene(command)
     command.add_argument("--frame", type=int, required=True, metavar="N", help="frame, counted from 0")
-    command.add_argument("--format", choices=("ply",), default="ply", help="ply: standard 3D Gaussian Splatting")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
+    command.add_argument(
+        "--triplet", default=None, metavar="NAME", help="one triplet as stored, as colour or position_hi (all, shown)"
+    )
+    _uv_map(command)
+    _output(command, "PNG", "picture to write")
+
+
+def _web(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    command.add_argument("--codec", choices=("vp9", "av1"), default="vp9", help="how the video streams are coded")
+    _output(command, "DIR", "folder to write, new or empty")
+    _json(command)
 
 
 def _render(command: argparse.ArgumentParser) -> None:
@@ -225,6 +316,15 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
 def _view(command: argparse.ArgumentParser) -> None:
     _scene(command)
     command.add_argument("--port", type=int, default=8787, help="TCP port on localhost; 0 picks a free one")
+
+
+def _uv_map(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--map", type=_positive, default=1024, metavar="N", help="side of the UV map, texels")
+    command.add_argument("--layers", type=_positive, default=8, metavar="K", help="layers of the UV map")
+
+
+def _output(command: argparse.ArgumentParser, metavar: str, text: str) -> None:
+    command.add_argument("-o", "--output", type=Path, required=True, metavar=metavar, help=text)
 
 
 def _seed(command: argparse.ArgumentParser) -> None:
@@ -260,6 +360,13 @@ def _range(text: str) -> tuple[int, int | None]:
     if not match or (stop is not None and stop <= (first or 0)):
         raise argparse.ArgumentTypeError(f"must be A:B with A < B, as 0:30 for the first thirty, but is {text!r}")
     return first or 0, stop
+
+
+def _rate(text: str) -> Fraction:
+    match = re.fullmatch(r"\d+(?:\.\d+)?|\d+/[1-9]\d*", text)
+    if not match or not Fraction(text) > 0:
+        raise argparse.ArgumentTypeError(f"must be a rate above 0 as 30, 29.97 or 30000/1001, but is {text!r}")
+    return Fraction(text)
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -1,22 +1,18 @@
-"""The commands beside `packuv run`: look at scene files, score them, take pictures and single frames out of them."""
+"""The commands beside `packuv run`: make a synthetic capture, look at scene files, check, draw and score them.
+
+What turns scenes into other programs' files, or those into scenes, is in `pipelines.exchange`.
+"""
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
-import os
-import platform
-import shutil
-import subprocess
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.progress import TerminalProgress
 from pipelines.request import read_settings
+from pipelines.terminal import print_facts, shown, size_text
 from tasks.recipe import override
 from tasks.store import Store
 
@@ -33,7 +29,7 @@ def simulate(arguments: argparse.Namespace) -> int:
     plain = {name: getattr(arguments, name) for name in ("cameras", "frames", "fps", "seed")}
     named = {**plain, "size": f"{width}x{height}", "rig": {"kind": arguments.rig}}
     options = override(override(SimulateOptions(), named), read_settings(None, arguments.set))
-    with _shown(arguments, "simulate") as progress:
+    with shown(arguments, "simulate") as progress:
         film(arguments.out, options, progress)
     print(f"{arguments.out}: {options.cameras} cameras, {options.frames} instants, {options.size}; truth in truth/")
     return 0
@@ -65,7 +61,7 @@ def info(arguments: argparse.Namespace) -> int:
             "extra": dict(header.extra),
             "tools": dict(index.tools),
         }
-    _print(facts, arguments.json, _info_text)
+    print_facts(facts, arguments.json, _info_text)
     return 0
 
 
@@ -75,7 +71,7 @@ def _info_text(facts: Mapping[str, Any]) -> str:
     held_out = f" (held out: {', '.join(facts['held_out'])})" if facts["held_out"] else ""
     return "\n".join(
         [
-            f"{facts['file']}: {_size(facts['bytes'])}, {_size(facts['bytes_per_frame'])} a frame",
+            f"{facts['file']}: {size_text(facts['bytes'])}, {size_text(facts['bytes_per_frame'])} a frame",
             f"frames     {facts['frames']} at {facts['rate']} per second, {facts['seconds']:.2f} s",
             f"segments   {len(counts)}, from frame {', '.join(str(s['first']) for s in facts['segments'])}",
             f"gaussians  {min(counts):,} to {max(counts):,}, of which {min(moving):,} to {max(moving):,} move; "
@@ -94,12 +90,12 @@ def verify(arguments: argparse.Namespace) -> int:
 def _verify_scene(arguments: argparse.Namespace) -> int:
     from packuv.scene import verify_scene
 
-    with _shown(arguments, "verify") as progress:
+    with shown(arguments, "verify") as progress:
         report = verify_scene(arguments.scene, progress=progress)
     facts = {"frames": report.frames, "bad": list(report.bad), "problem": report.problem, "ok": report.ok}
     good = f"{arguments.scene}: all {report.frames} frames decode to exactly what was fitted"
     bad = f"{arguments.scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
-    _print(facts, arguments.json, lambda _: good if report.ok else bad)
+    print_facts(facts, arguments.json, lambda _: good if report.ok else bad)
     return 0 if report.ok else 1
 
 
@@ -114,7 +110,7 @@ def _verify_store(arguments: argparse.Namespace) -> int:
     }
     lines = [f"{found}; delete {store.root / str(found.key)} and run again" for store, found in damage]
     lines.append(f"{count} artefacts in {len(stores)} stores, {len(damage) or 'no'} damaged files")
-    _print(facts, arguments.json, lambda _: "\n".join(lines))
+    print_facts(facts, arguments.json, lambda _: "\n".join(lines))
     return 1 if damage else 0
 
 
@@ -128,30 +124,13 @@ def _stores(folder: Path) -> list[Path]:
     raise FileNotFoundError(f"{folder} holds no artefact store; name the folder that `packuv run --out` wrote")
 
 
-def export(arguments: argparse.Namespace) -> int:
-    """`packuv export`: one frame as a file of another program."""
-    from packuv.interchange import write_ply
-    from packuv.scene import open_scene
-
-    with open_scene(arguments.scene) as scene:
-        _check_frame(arguments.frame, len(scene))
-        count = write_ply(arguments.output, scene.gaussians(arguments.frame))
-    print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}")
-    return 0
-
-
-def _check_frame(frame: int, count: int) -> None:
-    if not 0 <= frame < count:
-        raise ValueError(f"the scene has frames 0 to {count - 1}, but frame {frame} is asked for")
-
-
 def render(arguments: argparse.Namespace) -> int:
     """`packuv render`: <frame>.png for each frame, numbered as in the scene."""
     from packuv.scene import open_scene
     from tasks.evaluate import Artist, frames_of, write_picture
 
     _check_device(arguments.device)
-    with open_scene(arguments.scene) as scene, _shown(arguments, "render") as progress:
+    with open_scene(arguments.scene) as scene, shown(arguments, "render") as progress:
         camera = _camera(arguments.camera, scene.header.cameras)
         if arguments.size:
             camera = camera.scaled(*arguments.size)
@@ -192,11 +171,11 @@ def evaluate(arguments: argparse.Namespace) -> int:
     from tasks.evaluate import EvaluateOptions, evaluate_scene
 
     _check_device(arguments.device)
-    with _shown(arguments, "evaluate") as progress:
+    with shown(arguments, "evaluate") as progress:
         facts = evaluate_scene(
             arguments.scene, arguments.capture, arguments.cameras, EvaluateOptions(), progress=progress
         )
-    _print(facts, arguments.json, _scores_text)
+    print_facts(facts, arguments.json, _scores_text)
     return 0
 
 
@@ -206,7 +185,7 @@ def _scores_text(facts: Mapping[str, Any]) -> str:
     for name, means in {**facts["by_camera"], "mean": facts["mean"]}.items():
         lines.append(f"{name:<12}" + "".join(f"{_score_text(means, kind):>22}" for kind in kinds))
     what = "held out, never fitted" if facts["held_out"] else "not all held out"
-    lines.append(f"{facts['frames']} frames, {_size(facts['bytes_per_frame'])} a frame; cameras {what}")
+    lines.append(f"{facts['frames']} frames, {size_text(facts['bytes_per_frame'])} a frame; cameras {what}")
     return "\n".join(lines)
 
 
@@ -222,77 +201,3 @@ def view(arguments: argparse.Namespace) -> int:
 
     serve(arguments.scene, port=arguments.port, open_browser=True)
     return 0
-
-
-def doctor(arguments: argparse.Namespace) -> int:
-    """`packuv doctor`: exit code 1 if something is missing that every run needs."""
-    found = list(_examine())
-    for name, state, needed in found:
-        print(f"{'ok' if state[0] else 'MISSING' if needed else 'absent':<8} {name:<12} {state[1]}")
-    return 0 if all(state[0] or not needed for _, state, needed in found) else 1
-
-
-def _examine() -> Iterator[tuple[str, tuple[bool, str], bool]]:
-    """What, whether and in which version it is there, and whether runs need it."""
-    yield "python", (sys.version_info >= (3, 11), platform.python_version()), True
-    yield "cores", (True, f"{len(os.sched_getaffinity(0))}"), True
-    yield "memory", _memory(), True
-    disk = shutil.disk_usage(Path.cwd())
-    yield "disk", (disk.free > 2**30, f"{_size(disk.free)} free here"), True
-    yield "ffmpeg", _ffmpeg(), True
-    for name in ("numpy", "numba", "torch", "torchcodec", "cv2", "av", "pyarrow", "prefect"):
-        yield name, _module(name), True
-    yield "pycolmap", _module("pycolmap"), False
-    yield "gpu", _gpu(), False
-    yield "gsplat", _module("gsplat"), False
-
-
-def _memory() -> tuple[bool, str]:
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return total > 3 * 2**30, _size(total)
-
-
-def _ffmpeg() -> tuple[bool, str]:
-    path = shutil.which("ffmpeg")
-    return path is not None, path or "not on the PATH; torchcodec loads its libraries: apt-get install ffmpeg"
-
-
-def _module(name: str) -> tuple[bool, str]:
-    try:
-        module = importlib.import_module(name)
-    except Exception as error:
-        return False, f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
-    return True, str(getattr(module, "__version__", "there"))
-
-
-def _gpu() -> tuple[bool, str]:
-    if (query := shutil.which("nvidia-smi")) is None:
-        return False, "no NVIDIA driver; the CPU does everything"
-    command = [query, "--query-gpu=name,memory.total", "--format=csv,noheader"]
-    answer = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
-    names = "; ".join(answer.stdout.splitlines())
-    return bool(names), names or "a driver, but no GPU"
-
-
-@contextmanager
-def _shown(arguments: argparse.Namespace, label: str) -> Iterator[Callable[..., None]]:
-    """A callback (done, total, note) that shows progress on the terminal while the block runs."""
-    progress = TerminalProgress(sys.stderr if getattr(arguments, "json", False) else sys.stdout)
-    progress.started(label)
-    try:
-        yield lambda done, total, note="": progress.moved(label, done, total, note)
-    finally:
-        progress.close()
-
-
-def _print(facts: Mapping[str, Any], as_json: bool, text: Callable[[Mapping[str, Any]], str]) -> None:
-    print(json.dumps(facts, indent=1) if as_json else text(facts))
-
-
-def _size(count: float) -> str:
-    """Bytes for people, decimal units."""
-    for unit in ("B", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.3g} {unit}" if unit != "B" else f"{count:.0f} B"
-        count /= 1000
-    return f"{count:,.1f} GB"

@@ -8,6 +8,7 @@ from typing import Any
 
 from packuv.keyframes import KeyframeOptions
 from packuv.motion import MotionOptions
+from packuv.scene import EncodeOptions
 from packuv.solver import FitOptions
 from pipelines.request import PRESETS
 from sync.align import AlignOptions
@@ -29,6 +30,7 @@ class SequenceOptions:
     motion: MotionOptions = field(default_factory=MotionOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
+    encode: EncodeOptions = field(default_factory=EncodeOptions)
     evaluate: EvaluateOptions = field(default_factory=EvaluateOptions)
 
 
@@ -39,7 +41,13 @@ _PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
     "standard": {
         "pictures": {"max_width": 1280},
-        "fit": {"iterations": 5000, "key_iterations": 1500, "frame_iterations": 150},
+        "fit": {
+            "iterations": 5000,
+            "key_iterations": 1500,
+            "frame_iterations": 150,
+            "start": {"count": 30_000},
+            "density": {"cap": 80_000},
+        },
     },
     "high": {
         "fit": {"iterations": 15000, "key_iterations": 4000, "frame_iterations": 400, "sh_degree": 3},

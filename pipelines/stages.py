@@ -77,7 +77,7 @@ def run_stages(
             case "fit":
                 _fit(workshop, plan, options, submit, made)
             case "encode":
-                parts = (made.keys["key"][0], made.keys["segment"], options.pictures)
+                parts = (made.keys["key"][0], made.keys["segment"], options.pictures, options.encode)
                 made.add(submit(encode, workshop, plan, made.only("sync"), made.only("points"), *parts).result())
             case "verify":
                 made.add(submit(verify, workshop, made.only("encode"), made.keys["segment"]).result())

@@ -13,9 +13,11 @@ import numpy as np
 from packuv.files import write_json
 from packuv.fit import KeyState
 from packuv.frames import undistorted_camera
-from packuv.scene import SceneHeader, open_scene, write_scene
+from packuv.quantize import OPACITY, Codes
+from packuv.scene import EncodeOptions, SceneHeader, open_scene, write_scene
 from packuv.segment import Segment
-from packuv.stream import in_storage_order
+from packuv.sharing import stored_segments
+from packuv.stream import Tolerance
 from sync.align import SyncReport
 from tasks.footage import Footage, PictureOptions, footage_of, lens_camera
 from tasks.jobs import Progress
@@ -24,8 +26,8 @@ from tasks.splat import SEGMENT
 from tasks.store import Key
 from tasks.workshop import Workshop
 
-ENCODE_VERSION = 1
-VERIFY_VERSION = 1
+ENCODE_VERSION = 2
+VERIFY_VERSION = 2
 SCENE = "scene.mkv"
 
 
@@ -37,13 +39,16 @@ def encode(
     first_key: Key,
     segments: Sequence[Key],
     pictures: PictureOptions,
+    options: EncodeOptions | None = None,
 ) -> Key:
-    """Write the scene file from the segments, in order."""
+    """Write the scene file from the segments, in order; by default lossless."""
+    options = options or EncodeOptions()
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=tuple(plan.videos), pictures=pictures),
         "held_out": plan.held_out,
         "key": workshop.path(first_key),
         "segments": [workshop.path(key) / SEGMENT for key in segments],
+        "options": options,
     }
     reads = {
         "cameras": list(plan.videos),
@@ -51,13 +56,54 @@ def encode(
         "first": plan.first,
         "stop": plan.stop,
         "pictures": pictures,
+        "encode": options,
     }
     inputs = {"groups": groups, "points": points, "key": first_key, "segments": list(segments)}
     return workshop.make("encode", ENCODE_VERSION, reads, inputs, "tasks.encode:build_scene", arguments)
 
 
+def encode_finished(
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    points: Key,
+    first_key: Key,
+    segments: Sequence[Key],
+    pictures: PictureOptions,
+    options: EncodeOptions | None = None,
+    *,
+    path: Path,
+) -> int:
+    """Write the first segments of a sequence as a scene file that ends after them; returns its number of frames.
+
+    For a run that stops early, or to watch one that goes on: `segments` are those that are fitted, without a gap from
+    the first on. The file is whole or absent at any time, and takes the place of one that is there. Nothing goes to
+    the store, for `encode` makes the same file of all segments.
+    """
+    footage = footage_of(workshop, plan, groups, points, cameras=tuple(plan.videos), pictures=pictures)
+    paths = [workshop.path(key) / SEGMENT for key in segments]
+    return write_finished(path, footage, plan.held_out, workshop.path(first_key), paths, options)
+
+
+def write_finished(
+    path: Path,
+    footage: Footage,
+    held_out: tuple[str, ...],
+    key: Path,
+    segments: Sequence[Path],
+    options: EncodeOptions | None = None,
+) -> int:
+    """Write the first segments of a sequence, by their files; see `encode_finished`."""
+    header = scene_header(footage, held_out, KeyState.load(key))
+    frames = sum(len(Segment.load(part)) for part in segments)
+    return write_scene(path, segments, header.first(frames), options=options).frames
+
+
 def verify(workshop: Workshop, scene: Key, segments: Sequence[Key]) -> Key:
-    """Decode the scene file and compare every frame with the fitted segments; raises RuntimeError on a difference."""
+    """Decode the scene file and compare every frame with the fitted segments.
+
+    Raises RuntimeError on a difference beyond the tolerance that the scene states.
+    """
     arguments = {
         "scene": workshop.path(scene) / SCENE,
         "segments": [workshop.path(key) / SEGMENT for key in segments],
@@ -71,13 +117,18 @@ def build_scene(
     held_out: tuple[str, ...],
     key: Path,
     segments: list[Path],
+    options: EncodeOptions,
     out: Path,
     progress: Progress,
 ) -> dict[str, Any]:
     """The job behind `encode`."""
     header = scene_header(footage, held_out, KeyState.load(key))
     summary = write_scene(
-        out / SCENE, segments, header, progress=lambda done, total: progress(done, total, "write and read back")
+        out / SCENE,
+        segments,
+        header,
+        options=options,
+        progress=lambda done, total: progress(done, total, "write and read back"),
     )
     notes = {"frames": summary.frames, "bytes": summary.bytes, "track_bytes": dict(summary.track_bytes)}
     write_json(out / "encode.json", notes)
@@ -113,24 +164,42 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState) -> 
 
 def build_verification(scene: Path, segments: list[Path], out: Path, progress: Progress) -> dict[str, Any]:
     """The job behind `verify`."""
-    frame = 0
+    frame, worst = 0, Tolerance()
     with open_scene(scene) as opened:
-        for path in segments:
-            stored = in_storage_order(Segment.load(path))
+        fitted = (Segment.load(path) for path in segments)
+        references = [entry.reference for entry in opened.index.segments]
+        if len(references) != len(segments):
+            raise RuntimeError(f"{scene} has {len(references)} segments, but {len(segments)} were fitted")
+        for path, stored in zip(segments, stored_segments(fitted, references=references), strict=True):
             for index in range(len(stored)):
-                found, expected = opened.codes(frame), stored.frame(index)
-                if not _same(found.xyz, expected.xyz) or not _same(found.attributes, expected.attributes):
-                    raise RuntimeError(f"frame {frame} of {scene} does not decode to what was fitted ({path})")
+                allowed = opened.index.tolerance if index else Tolerance()
+                worst = _worse(worst, opened.codes(frame), stored.frame(index), allowed, f"frame {frame} ({path})")
                 frame += 1
                 progress(frame, len(opened), "")
         if frame != len(opened):
             raise RuntimeError(f"{scene} has {len(opened)} frames, but {frame} were fitted")
-    write_json(out / "verify.json", {"frames": frame, "exact": True})
-    return {"frames": frame}
+    notes = {"frames": frame, "exact": worst.exact, "largest_error": vars(worst)}
+    write_json(out / "verify.json", notes)
+    return notes
 
 
-def _same(found: np.ndarray, expected: np.ndarray) -> bool:
-    return found.dtype == expected.dtype and np.array_equal(found, expected)
+def _worse(worst: Tolerance, found: Codes, fitted: Codes, allowed: Tolerance, what: str) -> Tolerance:
+    """The largest errors so far; raises RuntimeError beyond what is allowed."""
+    if found.xyz.shape != fitted.xyz.shape or found.attributes.shape != fitted.attributes.shape:
+        raise RuntimeError(f"{what} does not decode to what was fitted: {len(found)} rows, not {len(fitted)}")
+    position = _largest_error(found.xyz, fitted.xyz)
+    attribute = _largest_error(found.attributes, fitted.attributes)
+    same_rows = np.array_equal(found.attributes[:, OPACITY] > 0, fitted.attributes[:, OPACITY] > 0)
+    if position > allowed.position or attribute > allowed.attribute or not same_rows:
+        raise RuntimeError(
+            f"{what} does not decode to what was fitted: codes differ by up to {position} and {attribute} steps, "
+            f"but {allowed.position} and {allowed.attribute} are allowed"
+        )
+    return Tolerance(max(worst.position, position), max(worst.attribute, attribute))
+
+
+def _largest_error(found: np.ndarray, fitted: np.ndarray) -> int:
+    return int(np.abs(found.astype(np.int32) - fitted.astype(np.int32)).max(initial=0))
 
 
 def _rate(groups: Path) -> Fraction:

@@ -81,9 +81,7 @@ def fit_next(
     options: FitOptions,
 ) -> Key:
     """Fit the keyframe at instant `step[1]` from the one at `step[0]`."""
-    options = _without(
-        options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell", "background"
-    )
+    options = _without(options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell")
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "previous": workshop.path(previous),
@@ -91,7 +89,7 @@ def fit_next(
         "motion": motion,
         "options": options,
     }
-    reads = {**_reads(plan, pictures, options), "motion": motion, "step": step}
+    reads = {**_reads(plan, pictures, options), "motion": motion, "step": step, "stop": plan.stop}
     inputs = {"groups": groups, "points": points, "previous": previous}
     label = f"fit key {step[1]}"
     return workshop.make("key", VERSION, reads, inputs, "tasks.splat:build_next", arguments, label=label)
@@ -155,7 +153,9 @@ def build_next(
     """The job behind `fit_next`."""
     views, before = footage.open_views(), KeyState.load(previous)
     masks = _changes(views, before.instant, instant, motion)
-    state = fit.fit_next(before, views, instant, masks=masks, options=options, progress=_counted(progress))
+    state = fit.fit_next(
+        before, views, instant, masks=masks, motion=motion, options=options, progress=_counted(progress)
+    )
     state.save(out)
     return dict(state.figures)
 

@@ -16,7 +16,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from calibration.importers import load_rig, write_colmap, write_transforms
+from calibration.exporters import write_colmap, write_poses_bounds, write_transforms
+from calibration.importers import load_rig
 from calibration.rig import Camera, Rig
 from tests.calibration_scene import arc, look_at, ring
 
@@ -285,6 +286,126 @@ def test_any_text_is_a_model_or_a_clear_error(tmp_path_factory, text):
     (folder / "cameras.txt").write_text(text)
     with pytest.raises(ValueError, match=r"cameras\.txt"):
         load_rig(folder)
+
+
+# LLFF and N3DV
+
+
+@st.composite
+def llff_rigs(draw):
+    """What the format can hold: one focal length, a centred principal point, names in order, no lens."""
+    rig = draw(rigs(coefficients=(0,)))
+    plain = [replace(c, fy=c.fx, cx=c.width / 2, cy=c.height / 2) for c in rig.cameras]
+    return Rig(tuple(sorted(plain, key=lambda camera: camera.name)), "drawn")
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@given(llff_rigs())
+def test_poses_bounds_round_trip(tmp_path_factory, rig):
+    path = tmp_path_factory.mktemp("llff") / "poses_bounds.npy"
+    bounds = np.tile([0.5, 20.0], (len(rig.cameras), 1))
+    write_poses_bounds(rig, path, bounds)
+    rows = np.load(path)
+    assert rows.shape == (len(rig.cameras), 17)
+    assert rows.dtype == np.float64
+    assert np.array_equal(rows[:, 15:], bounds)
+    assert_same(load_rig(path, rig.names), rig)
+    assert_same(load_rig(path.parent, rig.names), rig)
+
+
+def test_poses_bounds_axes_are_down_right_back(tmp_path):
+    camera = Camera("a", 640, 360, 500.0, 500.0, 320.0, 180.0, np.eye(4))
+    write_poses_bounds(Rig((camera,), ""), tmp_path / "poses_bounds.npy", np.array([[1.0, 2.0]]))
+    pose = np.load(tmp_path / "poses_bounds.npy")[0, :15].reshape(3, 5)
+    assert np.array_equal(pose, [[0, 1, 0, 0, 360], [1, 0, 0, 0, 640], [0, 0, -1, 0, 500]])
+
+
+def test_rows_of_poses_bounds_go_by_order_or_by_number(tmp_path):
+    rig = Rig(tuple(replace(c, name=f"cam{k:02d}") for k, c in enumerate(square(4).cameras)), "")
+    write_poses_bounds(rig, tmp_path / "poses_bounds.npy", np.ones((4, 2)))
+    names = ["cam20", "cam03", "cam11", "cam08"]  # as many as rows: in order of their names, as N3DV has it
+    loaded = load_rig(tmp_path, names)
+    for number, name in enumerate(sorted(names)):
+        assert np.allclose(loaded[name].camera_from_world, rig.cameras[number].camera_from_world, atol=POSE_TOLERANCE)
+    fewer = load_rig(tmp_path, ["cam03", "cam01"])
+    assert np.allclose(fewer["cam03"].camera_from_world, rig["cam03"].camera_from_world, atol=POSE_TOLERANCE)
+    with pytest.raises(ValueError, match="4 rows, which belong to the videos in the order of their names"):
+        load_rig(tmp_path, ["cam03", "cam07"])
+
+
+def square(count: int) -> Rig:
+    """A ring that poses_bounds.npy can hold."""
+    plain = [replace(c, fy=c.fx, cx=c.width / 2, cy=c.height / 2, distortion=()) for c in ring(count).cameras]
+    return Rig(tuple(plain), "")
+
+
+def test_poses_bounds_refuses_what_it_cannot_hold(tmp_path):
+    path, bounds = tmp_path / "poses_bounds.npy", np.ones((3, 2))
+    for change in ({"fy": 400.0}, {"cx": 300.0}, {"distortion": (0.1, 0.0, 0.0, 0.0)}):
+        rig = square(3)
+        with pytest.raises(ValueError, match="write COLMAP or transforms"):
+            write_poses_bounds(Rig((*rig.cameras[:2], replace(rig.cameras[2], **change)), ""), path, bounds)
+    with pytest.raises(ValueError, match="sort the rig"):
+        write_poses_bounds(Rig(square(3).cameras[::-1], ""), path, bounds)
+    assert not path.exists()
+    np.save(path, np.ones((3, 15)))
+    with pytest.raises(ValueError, match=r"row of 17 finite numbers for each camera, but is \(3, 15\)"):
+        load_rig(path)
+
+
+# EasyMocap
+
+
+def write_easymocap(folder: Path, rig: Rig, *, sizes: bool = True, matrices: bool = True) -> None:
+    intri = cv2.FileStorage(str(folder / "intri.yml"), cv2.FILE_STORAGE_WRITE)
+    extri = cv2.FileStorage(str(folder / "extri.yml"), cv2.FILE_STORAGE_WRITE)
+    intri.startWriteStruct("names", cv2.FILE_NODE_SEQ)
+    for name in rig.names:
+        intri.write("", name)
+    intri.endWriteStruct()
+    for camera in rig.cameras:
+        matrix = camera.matrix - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        intri.write(f"K_{camera.name}", matrix)
+        intri.write(f"dist_{camera.name}", np.array([(*camera.distortion, *(0.0,) * 5)[:5]]))
+        if sizes:
+            intri.write(f"H_{camera.name}", camera.height)
+            intri.write(f"W_{camera.name}", float(camera.width))
+        rotation = np.ascontiguousarray(camera.camera_from_world[:3, :3])
+        extri.write(f"R_{camera.name}", cv2.Rodrigues(rotation)[0])
+        if matrices:
+            extri.write(f"Rot_{camera.name}", rotation)
+        extri.write(f"T_{camera.name}", np.ascontiguousarray(camera.camera_from_world[:3, 3:]))
+    intri.release()
+    extri.release()
+
+
+@pytest.mark.parametrize("matrices", [True, False])
+def test_easymocap_calibrations_are_read(tmp_path, matrices):
+    rig = arc(3, lens=(0.1, -0.05, 0.001, 0.002, 0.03))
+    write_easymocap(tmp_path, rig, matrices=matrices)
+    for source in (tmp_path, tmp_path / "intri.yml", tmp_path / "extri.yml"):
+        loaded = load_rig(source, rig.names)
+        for a, b in zip(loaded.cameras, rig.cameras, strict=True):
+            assert (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
+            assert np.allclose(a.matrix, b.matrix, rtol=0, atol=POSE_TOLERANCE)
+            assert np.allclose(a.camera_from_world, b.camera_from_world, rtol=0, atol=POSE_TOLERANCE)
+
+
+def test_unusable_easymocap_files_say_what_is_missing(tmp_path):
+    write_easymocap(tmp_path, ring(2), sizes=False)
+    with pytest.raises(ValueError, match=r"must give camera 'cam00' its picture size, as H_cam00: 1080"):
+        load_rig(tmp_path)
+    write_easymocap(tmp_path, ring(2))
+    (tmp_path / "intri.yml").write_text((tmp_path / "intri.yml").read_text().replace("K_cam01", "K_cam09"))
+    with pytest.raises(ValueError, match="K_cam01 must be a matrix of 3 x 3 numbers"):
+        load_rig(tmp_path)
+    (tmp_path / "intri.yml").write_text("names: [a]\n  - {")
+    with pytest.raises(ValueError, match=r"intri\.yml"):
+        load_rig(tmp_path)
+    write_easymocap(tmp_path, ring(2))
+    (tmp_path / "extri.yml").unlink()
+    with pytest.raises(FileNotFoundError, match="side by side"):
+        load_rig(tmp_path)
 
 
 # Real calibrations

@@ -6,19 +6,22 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from packuv.interchange import CHUNK, DRAWN_LOGIT, SH_C0, read_ply, write_ply
-from packuv.quantize import OPACITY_RANGE, Gaussians
+from packuv.interchange import (
+    CHUNK,
+    DRAWN_LOGIT,
+    SH_C0,
+    SplatFormat,
+    read_gaussians,
+    read_ply,
+    write_compressed_ply,
+    write_gaussians,
+    write_ply,
+)
+from packuv.model import rows_of
+from packuv.quantize import OPACITY_RANGE
+from tests.splats import FIELDS, alpha_of, random_gaussians, rotation_error
 
 SPLATS = Path(os.environ.get("PACKUV_DATA", Path(__file__).parents[1] / "../shared/data")) / "splats"
-FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
-
-
-def random_gaussians(count, degree, seed=0):
-    rng = np.random.default_rng(seed)
-    shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, (degree + 1) ** 2, 3)]
-    means, scales, quaternions, opacity, sh = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return Gaussians(means, scales, quaternions, opacity, sh)
 
 
 def header_of(path):
@@ -181,6 +184,69 @@ def test_a_compressed_ply_is_read_within_its_own_precision(tmp_path):
     expected = ((sh_codes + 0.5) / 256 - 0.5) * 8
     expected[sh_codes == 0], expected[sh_codes == 255] = -4, 4
     assert np.allclose(back.sh[:, 1:].transpose(0, 2, 1).reshape(CHUNK, 9), expected, atol=1e-6)
+
+
+def in_written_order(gaussians, written):
+    """The rows of `gaussians` as a compressed PLY sorted them: nearest by position."""
+    distance = np.linalg.norm(gaussians.means[None] - written.means[:, None], axis=2)
+    rows = distance.argmin(axis=1)
+    assert len(set(rows.tolist())) == len(rows)
+    return rows_of(gaussians, rows)
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, 600), st.integers(0, 3), st.integers(0, 2**32 - 1))
+def test_a_compressed_ply_that_is_written_is_read_within_its_own_precision(tmp_path, count, degree, seed):
+    gaussians = random_gaussians(count, degree, seed)
+    gaussians.means[:] *= 50  # far apart, so that the nearest is the same
+    assert write_compressed_ply(tmp_path / "a.compressed.ply", gaussians) == count
+    back = read_ply(tmp_path / "a.compressed.ply")
+    assert (len(back), back.sh_degree) == (count, degree)
+    if not count:
+        return
+    truth = in_written_order(gaussians, back)
+    for start in range(0, count, CHUNK):
+        part = slice(start, start + CHUNK)
+        for name in ("means", "log_scales"):
+            a, b = getattr(truth, name)[part], getattr(back, name)[part]
+            # Half of the coarsest step, 10 bits of the chunk's range, and float32 rounding of the range.
+            assert (np.abs(a - b) <= 0.501 / 1023 * np.ptp(a, axis=0) + 1e-5).all()
+        colour = truth.sh[part, 0]
+        assert (np.abs(colour - back.sh[part, 0]) <= 0.501 / 255 * np.ptp(colour, axis=0) + 1e-5).all()
+    assert rotation_error(truth, back).max() < 0.0025  # as for a file of SuperSplat's, above
+    assert np.abs(alpha_of(truth) - alpha_of(back)).max() <= 0.501 / 255
+    inside = np.clip(truth.sh[:, 1:], -4 + 8 / 256, 4 - 8 / 256)
+    assert np.abs(inside - np.clip(back.sh[:, 1:], -4 + 8 / 256, 4 - 8 / 256)).max(initial=0) <= 4.001 / 256
+
+
+def test_a_chunk_of_equal_gaussians_and_wild_scales_stay_finite(tmp_path):
+    gaussians = random_gaussians(3, 0)
+    gaussians.means[:], gaussians.log_scales[:] = gaussians.means[0], [-np.inf, 3, np.inf]
+    write_compressed_ply(tmp_path / "a.compressed.ply", gaussians)
+    back = read_ply(tmp_path / "a.compressed.ply")
+    assert np.array_equal(back.means, gaussians.means)
+    assert np.allclose(back.log_scales, [-20, 3, 20], atol=40 / 1023)
+
+
+@pytest.mark.parametrize("kind", list(SplatFormat))
+def test_every_format_is_found_again_by_its_name_and_written_whole(tmp_path, kind):
+    gaussians = random_gaussians(40, 1)
+    gaussians.opacity_logits[:7] = OPACITY_RANGE[0]
+    path = tmp_path / f"a{kind.suffix}"
+    assert write_gaussians(path, gaussians, kind=kind) == 33
+    assert len(read_gaussians(path)) == 33
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    with pytest.raises(FileNotFoundError, match="no folder"):
+        write_gaussians(tmp_path / "missing" / "a.ply", gaussians, kind=kind)
+
+
+def test_what_is_no_splat_file_is_refused_by_name(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no splat file"):
+        read_gaussians(tmp_path / "a.ply")
+    (tmp_path / "a.obj").write_text("v 0 0 0")
+    for path in (tmp_path, tmp_path / "a.obj"):
+        with pytest.raises(ValueError, match=r"no splat file that we read: \.ply, \.spz, \.sog"):
+            read_gaussians(path)
 
 
 @pytest.mark.skipif(not SPLATS.is_dir(), reason="needs trained scenes under PACKUV_DATA")

@@ -1,9 +1,15 @@
+import copy
+import gc
 import hashlib
 import json
+import os
 import re
 import shutil
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +17,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import packuv
 from packuv.camera import PinholeCamera
+from packuv.encoder import TOLERANCES, Quality
+from packuv.lookahead import Address
+from packuv.matroska import Packet, write_matroska
 from packuv.quantize import OPACITY, Codes, Quantizer, attribute_count
-from packuv.scene import SceneHeader, VerifyReport, digest, open_scene, verify_scene, write_scene
+from packuv.scene import EncodeOptions, SceneHeader, VerifyReport, digest, open_scene, verify_scene, write_scene
 from packuv.segment import Segment
-from packuv.stream import in_storage_order
+from packuv.sharing import KeyPlanner, stored_segments
+from packuv.stream import Tolerance
 
 DOCUMENT = Path(__file__).parents[1] / "docs/scene-format.md"
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg program")
@@ -37,11 +48,17 @@ def random_segment(rng, first, rows, dynamic, frames, degree):
     return Segment(first, key, mask, np.stack(xyz)[1:], np.stack(attributes)[1:])
 
 
-def random_sequence(seed, shapes, degree=0):
-    """Segments that follow one another, from (rows, dynamic, frames) each."""
+def random_sequence(seed, shapes, degree=0, shared=0.8):
+    """Segments that follow one another, from (rows, dynamic, frames) each; keys share rows with the one before."""
     rng, first, result = np.random.default_rng(seed), 0, []
     for rows, dynamic, frames in shapes:
-        result.append(random_segment(rng, first, rows, dynamic, frames, degree))
+        segment = random_segment(rng, first, rows, dynamic, frames, degree)
+        if result:
+            before = result[-1].key
+            count = min(int(shared * rows), len(before))
+            there, here = (np.sort(rng.permutation(n)[:count]) for n in (len(before), rows))
+            segment.key.xyz[here], segment.key.attributes[here] = before.xyz[there], before.attributes[there]
+        result.append(segment)
         first += frames
     return result
 
@@ -73,11 +90,13 @@ def same(a, b):
     return np.array_equal(a.xyz, b.xyz) and np.array_equal(a.attributes, b.attributes)
 
 
-def frames_of(segments):
-    return [stored.frame(k) for stored in map(in_storage_order, segments) for k in range(len(stored))]
+def frames_of(segments, reach=3):
+    planner = KeyPlanner(reach)
+    references = [planner.plan(segment).reference for segment in segments]
+    return [stored.frame(k) for stored in stored_segments(segments, references=references) for k in range(len(stored))]
 
 
-SHAPES = [(300, 90, 5), (1, 1, 3), (40, 0, 4), (700, 700, 2), (9, 9, 1), (1500, 20, 6)]
+SHAPES = [(300, 90, 5), (310, 60, 3), (40, 0, 4), (700, 700, 2), (690, 9, 1), (1500, 20, 6)]
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +105,8 @@ def scene_file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     segments = random_sequence(0, SHAPES)
     write_scene(folder / "scene.mkv", save(folder, segments), make_header(21))
+    with open_scene(folder / "scene.mkv") as scene:
+        assert [entry.reference for entry in scene.index.segments] == [None, 0, 1, 0, 3, 3]
     return folder / "scene.mkv", frames_of(segments)
 
 
@@ -126,6 +147,20 @@ def test_constant_channels_and_a_still_scene_take_no_space(tmp_path):
     with open_scene(tmp_path / "scene.mkv") as scene:
         assert len(scene.index.tracks[0].mosaic.channels) == 1
         assert all(same(scene.codes(frame), still.frame(frame)) for frame in range(5))
+
+
+def test_frames_and_scenes_without_anybody_come_back(tmp_path):
+    segments = random_sequence(3, [(60, 30, 4), (1, 1, 2)])
+    segments[0].key.attributes[:, OPACITY] = 0
+    segments[0].attributes[1, :, OPACITY] = 0
+    segments[1].key.attributes[:, OPACITY] = segments[1].attributes[:, :, OPACITY] = 0
+    for tolerance in (Tolerance(), Tolerance(3, 1)):
+        path, options = tmp_path / "scene.mkv", EncodeOptions(tolerance)
+        write_scene(path, save(tmp_path, segments), make_header(6), options=options)
+        with open_scene(path) as scene:
+            present = [int((scene.codes(frame).attributes[:, OPACITY] > 0).sum()) for frame in range(6)]
+        assert present[0] == present[2] == present[4] == present[5] == 0
+        assert present[1] == int((segments[0].attributes[0, :, OPACITY] > 0).sum()) > 0
 
 
 def test_floats_are_those_of_the_quantizer(scene_file):
@@ -170,6 +205,140 @@ def test_frames_are_found_by_time(scene_file):
             scene.codes(21)
 
 
+def test_iteration_gives_every_frame(scene_file):
+    path, frames = scene_file
+    with packuv.open(str(path)) as scene:
+        for gaussians, codes in zip(scene, frames, strict=True):
+            assert np.array_equal(gaussians.means, quantizer().decode(codes).means)
+        assert len(list(scene)) == 21  # a second time
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_looking_ahead_changes_nothing(scene_file, threads):
+    path, frames = scene_file
+    order = [*range(21), 3, 4, 5, 4, 20, 0, 1, 6, 7, 8, 9, 10, 2, 19, 20]
+    with open_scene(path, threads=threads) as scene:
+        for frame in order:
+            assert same(scene.codes(frame), frames[frame])
+
+
+def test_parallel_readers_do_not_disturb_each_other(scene_file):
+    path, frames = scene_file
+
+    def read(seed):
+        with open_scene(path, threads=2) as scene:
+            for frame in np.random.default_rng(seed).permutation(21).tolist() + list(range(21)):
+                assert same(scene.codes(frame), frames[frame])
+                assert len(scene.gaussians(frame)) == len(frames[frame])
+        return True
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(read, range(4)))
+
+
+def test_keys_are_read_in_a_bounded_number(tmp_path):
+    segments = random_sequence(5, [(200, 20, 2)] * 12, shared=0.9)
+    summaries = {}
+    for reach in (1, 3):
+        options = EncodeOptions(reach=reach)
+        path = tmp_path / f"{reach}.mkv"
+        summaries[reach] = write_scene(path, save(tmp_path, segments), make_header(24), options=options)
+        with open_scene(path) as scene:
+            for number, frames in enumerate(frames_of(segments, reach)):
+                assert same(scene.codes(number), frames)
+            assert max(len(scene._way(number)) for number in range(12)) == reach
+    assert summaries[3].track_bytes["key"] < 0.6 * summaries[1].track_bytes["key"]
+
+
+def test_memory_stays_flat_over_a_thousand_frames(tmp_path):
+    segments = random_sequence(2, [(600, 300, 20)], shared=0)
+    segments = [replace(segments[0], first=20 * k) for k in range(50)]
+    header = make_header(1000)
+    write_scene(tmp_path / "scene.mkv", save(tmp_path, segments), header)
+    held = []
+    with open_scene(tmp_path / "scene.mkv") as scene:
+        for frame, gaussians in enumerate(scene):
+            if frame % 200 == 199:
+                held.append(resident_bytes())
+            del gaussians
+    assert len(held) == 5
+    assert held[-1] - held[0] < 4e6  # 800 frames' floats alone would be 27 MB
+
+
+def resident_bytes():
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.slow
+def test_a_million_gaussians(tmp_path):
+    segments = random_sequence(4, [(2**20, 2**18, 2), (2**20, 2**18, 2)])
+    frames = frames_of(segments)
+    write_scene(tmp_path / "scene.mkv", save(tmp_path, segments), make_header(4))
+    with open_scene(tmp_path / "scene.mkv") as scene:
+        assert scene.index.segments[1].own < 2**18
+        assert all(same(scene.codes(frame), frames[frame]) for frame in (3, 0, 1, 2))
+
+
+# With a tolerance
+
+
+LOSSY = EncodeOptions(tolerance=Tolerance(20, 2))
+
+
+@pytest.fixture(scope="module")
+def lossy_file(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lossy")
+    segments = random_sequence(0, SHAPES)
+    write_scene(folder / "scene.mkv", save(folder, segments), make_header(21), options=LOSSY)
+    return folder / "scene.mkv", frames_of(segments)
+
+
+def test_a_lossy_scene_says_so_and_stays_within_its_tolerance(lossy_file, scene_file):
+    path, frames = lossy_file
+    assert verify_scene(path).ok
+    assert path.stat().st_size < 0.95 * scene_file[0].stat().st_size
+    worst = [0, 0]
+    with open_scene(path) as scene:
+        assert scene.index.tolerance == Tolerance(20, 2)
+        for number, wanted in enumerate(frames):
+            found = scene.codes(number)
+            errors = [np.abs(getattr(found, n).astype(int) - getattr(wanted, n)) for n in ("xyz", "attributes")]
+            worst = [max(w, int(e.max())) for w, e in zip(worst, errors, strict=True)]
+            assert np.array_equal(found.attributes[:, OPACITY] > 0, wanted.attributes[:, OPACITY] > 0)
+    assert worst == [20, 2]
+
+
+def test_keys_of_a_lossy_scene_are_exact(lossy_file):
+    path, frames = lossy_file
+    with open_scene(path) as scene:
+        for entry in scene.index.segments:
+            assert same(scene.codes(entry.first), frames[entry.first])
+
+
+def test_every_quality_has_its_tolerance_and_each_is_coarser_than_the_last():
+    ladder = [TOLERANCES[quality] for quality in Quality]
+    assert ladder[0].exact
+    for finer, coarser in pairwise(ladder):
+        assert finer.position < coarser.position
+        assert finer.attribute <= coarser.attribute
+
+
+# The beginning of a sequence
+
+
+def test_a_run_that_stops_early_leaves_its_first_segments(scene_file, tmp_path):
+    segments = random_sequence(0, SHAPES)
+    paths = save(tmp_path, segments)
+    for count in (1, 3, 6):
+        frames = sum(len(segment) for segment in segments[:count])
+        write_scene(tmp_path / "scene.mkv", paths[:count], make_header(21).first(frames))
+        with open_scene(tmp_path / "scene.mkv") as scene:
+            assert len(scene) == len(scene.header.times_ns) == frames
+            assert all(same(scene.codes(k), wanted) for k, wanted in enumerate(scene_file[1][:frames]))
+    assert (tmp_path / "scene.mkv").read_bytes() == scene_file[0].read_bytes()
+
+
 # The file
 
 
@@ -179,14 +348,17 @@ def test_same_input_same_bytes_whatever_the_threads(scene_file, tmp_path):
 
 
 @needs_ffmpeg
-def test_the_decoder_in_the_document_reads_the_scene(scene_file, tmp_path):
+@pytest.mark.parametrize("kind", ["scene_file", "lossy_file"])
+def test_the_decoder_in_the_document_reads_the_scene(kind, request):
+    path, _ = request.getfixturevalue(kind)
     (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
     names: dict = {}
     exec(code, names)
-    decoded = list(names["frames"](str(scene_file[0])))
+    decoded = list(names["frames"](str(path)))
     assert len(decoded) == 21
-    for (xyz, attributes), codes in zip(decoded, scene_file[1], strict=True):
-        assert same(Codes(xyz, attributes), codes)
+    with open_scene(path) as scene:
+        for frame, (xyz, attributes) in enumerate(decoded):
+            assert same(Codes(xyz, attributes), scene.codes(frame))
 
 
 @needs_ffmpeg
@@ -204,7 +376,8 @@ def test_ffmpeg_sees_the_same_pictures_and_the_checksum_fits_the_header(scene_fi
     raw = subprocess.run(command, check=True, capture_output=True).stdout
     with open_scene(path) as scene:
         starts = [segment["first"] for segment in header["segments"]]
-        pictures = [scene._picture(0, number, first) for number, first in enumerate(starts)]
+        addresses = [Address(0, number, first) for number, first in enumerate(starts)]
+        pictures = [scene._pictures.picture(address, []) for address in addresses]
     assert raw == b"".join(picture.tobytes() for picture in pictures)
 
 
@@ -233,7 +406,7 @@ def test_progress_counts_every_frame_twice(tmp_path):
 
 
 def test_a_whole_file_verifies(scene_file):
-    assert verify_scene(scene_file[0]) == VerifyReport(21, (), "")
+    assert verify_scene(scene_file[0]) == VerifyReport(21)
 
 
 def damaged(scene_file, tmp_path, content):
@@ -287,15 +460,82 @@ def test_a_damaged_packet_is_named_and_costs_the_rest_of_its_segment(scene_file,
     content[found.position + len(found.data) // 2] ^= 1
     report = verify_scene(damaged(scene_file, tmp_path, bytes(content)))
     assert report.bad == tuple(range(step, 5))
-    assert (
-        f"packet {entry.packet(step)} of track 'dynamic' (frame {step}, bytes from {found.position} on)"
-        in report.problem
-    )
+    start, stop = report.span
+    assert report.track == "dynamic"
+    assert start <= found.position + len(found.data) // 2 < stop
+    assert content[start:stop] != path.read_bytes()[start:stop]
+    place = f"packet {entry.packet(step)} of track 'dynamic' (frame {step}, bytes {start} to {stop - 1})"
+    assert place in report.problem
     with open_scene(tmp_path / "damaged.mkv") as scene:
-        with pytest.raises(ValueError, match="is damaged"):
+        with pytest.raises(ValueError, match="differs from what was written"):
             scene.codes(4)
         assert same(scene.codes(0), frames[0])
         assert same(scene.codes(20), frames[20])
+
+
+def test_a_damaged_key_costs_those_that_refer_to_it_and_no_others(scene_file, tmp_path):
+    path, frames = scene_file
+    with open_scene(path) as scene:
+        entry = scene.index.segments[1]
+        found = scene._reader.read(0, int(scene.header.times_ms[entry.first]))
+    content = bytearray(path.read_bytes())
+    content[found.span(path)[0] + 40] ^= 16
+    report = verify_scene(damaged(scene_file, tmp_path, bytes(content)))
+    assert report.bad == tuple(range(5, 12))  # segments 1 and 2
+    assert report.track == "key"
+    assert "packet 1 of track 'key' (frame 5" in report.problem
+    with open_scene(tmp_path / "damaged.mkv") as scene:
+        for frame in (*range(5), *range(12, 21)):
+            assert same(scene.codes(frame), frames[frame])
+
+
+def elements(content, start, stop, depth=0):
+    """Starts of all EBML elements of a Matroska file, those inside master elements included."""
+    masters = {0x18538067, 0x1F43B675, 0x1654AE6B, 0xAE, 0xE0, 0x1941A469, 0x61A7, 0x1254C367, 0x7373, 0xA0, 0x1C53BB6B}
+    while start < stop:
+        yield start
+        length = 9 - content[start].bit_length()
+        name = int.from_bytes(content[start : start + length])
+        place = start + length
+        width = 9 - content[place].bit_length()
+        size = int.from_bytes(content[place : place + width]) & ((1 << 7 * width) - 1)
+        inside = place + width
+        end = stop if size == (1 << 7 * width) - 1 else inside + size
+        if name in masters:
+            yield from elements(content, inside, end, depth + 1)
+        start = end
+
+
+def openable(path):
+    """Whether a file's header is whole; if not, it is said which file's."""
+    try:
+        open_scene(path, threads=1).close()
+    except ValueError as error:
+        return str(path) not in str(error)
+    return True
+
+
+def test_a_file_cut_at_any_element_says_so_and_gives_what_is_left(scene_file, tmp_path):
+    path, frames = scene_file
+    content = path.read_bytes()
+    starts = sorted(set(elements(content, 0, len(content))))
+    with open_scene(path) as scene:
+        last = scene._reader.read(1, int(scene.header.times_ms[20])).span(path)[0]
+    places = [start for start in starts if 0 < start < last]
+    assert len(places) > 90  # headers, both attachments, clusters, every block and what it is made of
+    saved = []
+    for place in places[:: max(1, len(places) // 60)]:
+        cut = damaged(scene_file, tmp_path, content[:place])
+        if not openable(cut):
+            continue
+        report = verify_scene(cut, threads=1)
+        assert not report.ok
+        good = sorted(set(range(21)) - set(report.bad))
+        saved.append(len(good))
+        with open_scene(cut, threads=1) as scene:
+            assert all(same(scene.codes(frame), frames[frame]) for frame in good[-3:])
+    assert saved == sorted(saved)  # the longer, the more
+    assert saved[-1] >= 15
 
 
 def test_damage_to_the_header_is_named(scene_file, tmp_path):
@@ -319,11 +559,14 @@ def rewritten(scene_file, tmp_path, change):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b'"version":1', b'"version":7', "it is packuv-scene version 7, layout compact; this program reads"),
+        (b'"version":2', b'"version":7', "it is packuv-scene version 7, layout compact; this program reads"),
         (b'"layout":"compact"', b'"layout":"compacT"', "layout compacT"),
         (b'"rows":300', b'"roWs":300', "lacks or misuses a field"),
         (b'"rows":300', b'"rows":1e9', "segment at frame 0 does not fit"),
         (b'"frames":5', b'"frames":4', "do not belong together"),
+        (b'"reference":3', b'"reference":5', "segment at frame 14 does not fit"),
+        (b'"own":300', b'"own":299', "segment at frame 0 does not fit"),
+        (b'"position":0', b'"position":-', "cannot be read"),
         (b'"width":64', b'"widtH":64', "a camera needs the field 'width'"),
         (b'"sh0_g"', b'"sh0_h"', "cannot be read"),
     ],
@@ -332,6 +575,52 @@ def test_a_header_that_makes_no_sense_is_refused(scene_file, tmp_path, old, new,
     path = rewritten(scene_file, tmp_path, lambda document: document.replace(old, new))
     with pytest.raises(ValueError, match=re.escape(message)):
         open_scene(path)
+
+
+def leaves(node, path=()):
+    """Paths of everything inside a JSON document."""
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in items:
+        yield (*path, key)
+        yield from leaves(value, (*path, key))
+
+
+ODD_VALUES = [None, True, -1, 0, 1, 3, 10**9, 2**70, 0.5, "", "x", [], {}, [1], {"a": 1}, float("nan")]
+
+
+@pytest.fixture(scope="module")
+def parts(scene_file):
+    """Header, packets in the order of the file, and tracks."""
+    with open_scene(scene_file[0]) as scene:
+        document, times = json.loads(scene._reader.attachments["packuv.json"]), scene.header.times_ms
+        places = [(address.track, int(times[address.frame])) for address in scene._wanted(0, 0, 20)]
+        packets = [Packet(*place, 33, scene._reader.read(*place).data) for place in places]
+        tracks = [entry.video(number) for number, entry in enumerate(scene.index.tracks)]
+    return document, packets, tracks
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_header_with_odd_values_is_refused_or_reads_without_a_crash(parts, tmp_path, data):
+    document, packets, tracks = parts
+    document = copy.deepcopy(document)
+    places = list(leaves(document))
+    place = data.draw(st.sampled_from([n for n in places if len(n) < 3]) | st.sampled_from(places))
+    node = document
+    for key in place[:-1]:
+        node = node[key]
+    if data.draw(st.booleans()) and isinstance(node, dict):
+        del node[place[-1]]
+    else:
+        node[place[-1]] = data.draw(st.sampled_from(ODD_VALUES))
+    text = json.dumps(document).encode()
+    checksum = f"{hashlib.sha256(text).hexdigest()}  packuv.json\n".encode()
+    attachments = {"packuv.json": ("application/json", text), "packuv.sha256": ("text/plain", checksum)}
+    odd = tmp_path / "odd.mkv"
+    write_matroska(odd, tracks, packets, attachments, rate=Fraction(30))
+    if openable(odd):
+        report = verify_scene(odd, threads=1)
+        assert report.ok or str(odd) in report.problem
 
 
 def test_what_is_no_scene_is_refused(tmp_path):

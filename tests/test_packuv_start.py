@@ -66,7 +66,9 @@ def test_cameras_without_a_common_volume_are_refused(ring):
     pictures = [np.zeros((3, 64, 96), np.float32)] * 4
     bounds = find_bounds(ring(4), near_share=0.1)
     with pytest.raises(ValueError, match="do the cameras look at a common volume"):
-        first_gaussians(away, pictures, bounds=bounds, surface=None, options=StartOptions(count=50), sh_degree=0, seed=0)
+        first_gaussians(
+            away, pictures, bounds=bounds, surface=None, options=StartOptions(count=50), sh_degree=0, seed=0
+        )
 
 
 def test_hull_points_lie_where_the_masks_meet(ring):

@@ -9,27 +9,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from packuv.interchange import read_ply
+from packuv.mosaic import NEUTRAL, Mosaic
 from packuv.quantize import OPACITY, OPACITY_RANGE, ROTATION, Codes, Gaussians, Quantizer, attribute_count
 from packuv.segment import Segment
+from packuv.sharing import stored_segments
 from packuv.stream import (
-    BLOCK,
     LINEAR,
-    NEUTRAL,
     PREVIOUS,
     REPEAT,
-    Mosaic,
+    Change,
     Playback,
+    Tolerance,
     changes,
     changing_channels,
     channel_names,
     entropy_bits,
-    hilbert,
     hold_absent,
-    in_storage_order,
     key_codes,
     key_rows,
-    morton_codes,
-    storage_order,
 )
 
 SPLATS = Path(os.environ.get("PACKUV_DATA", Path(__file__).parents[1] / "../shared/data")) / "splats"
@@ -70,61 +67,15 @@ def same(a: Codes, b: Codes) -> bool:
     return np.array_equal(a.xyz, b.xyz) and np.array_equal(a.attributes, b.attributes)
 
 
-def full_mosaic(capacity, channels):
-    return Mosaic.of(capacity, tuple(range(channels)), channels)
+EXACT = Tolerance()
 
 
-# Order
+def in_stored_order(segment):
+    (stored,) = stored_segments([segment], references=[None])
+    return stored
 
 
-def test_morton_codes_interleave_the_bits():
-    xyz = np.random.default_rng(0).integers(0, 65536, (200, 3), np.uint16)
-    for position, code in zip(xyz.tolist(), morton_codes(xyz).tolist(), strict=True):
-        assert code == sum((position[a] >> b & 1) << (3 * b + a) for b in range(16) for a in range(3))
-
-
-def test_the_hilbert_curve_fills_a_block_step_by_step():
-    x, y = hilbert(np.arange(BLOCK**2))
-    assert len(set(zip(x.tolist(), y.tolist(), strict=True))) == BLOCK**2
-    assert (np.abs(np.diff(x)) + np.abs(np.diff(y)) == 1).all()
-    assert (x[0], y[0], x[-1], y[-1]) == (0, 0, BLOCK - 1, 0)
-
-
-@settings(max_examples=30, deadline=None)
-@given(segments)
-def test_storage_order_permutes_rows_and_puts_the_dynamic_ones_first(segment):
-    order, stored = storage_order(segment), in_storage_order(segment)
-    assert np.array_equal(np.sort(order), np.arange(len(segment.key)))
-    assert np.array_equal(stored.dynamic, np.sort(segment.dynamic)[::-1])
-    for index in range(len(segment)):
-        assert same(stored.frame(index), segment.frame(index)[order])
-
-
-# Pictures
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(0, 3000), st.sets(st.integers(0, 60), min_size=1, max_size=61), st.integers(0, 2**32 - 1))
-def test_a_mosaic_gives_back_its_rows(count, chosen, seed):
-    channels = tuple(sorted(chosen))
-    mosaic = Mosaic.of(count, channels, 61)
-    rng = np.random.default_rng(seed)
-    rows, constants = rng.integers(0, 256, (count, 61), np.uint8), rng.integers(0, 256, 61, np.uint8)
-    rows[:, [c for c in range(61) if c not in chosen]] = constants[[c for c in range(61) if c not in chosen]]
-    picture = mosaic.draw(rows)
-    assert np.array_equal(mosaic.read(picture, constants, count), rows)
-    assert (picture != NEUTRAL).sum() == (rows[:, channels] != NEUTRAL).sum()  # unused cells are neutral
-    across, down = mosaic.grid
-    assert len(channels) <= across * down
-    assert down <= across <= 2 * down  # what FFV1 can slice
-    assert picture.shape == (mosaic.height, mosaic.width)
-
-
-def test_cells_of_a_plane_are_its_own():
-    mosaic = full_mosaic(3000, 5)
-    used = np.concatenate([corner + mosaic.cells for corner in mosaic.corners])
-    assert len(np.unique(used)) == 5 * mosaic.capacity
-    assert mosaic.capacity >= 3000
+# Bytes
 
 
 def test_channel_names_are_one_per_byte():
@@ -143,22 +94,25 @@ def test_key_bytes_are_reversible(seed, count, degree):
 # Changes
 
 
-def play(stored, mosaic):
-    """Every frame of a segment, by way of pictures."""
-    count = stored.xyz.shape[1]
-    playback = Playback(Codes(stored.key.xyz.copy(), stored.key.attributes.copy()), count)
-    for change in changes(stored):
-        picture = None if change.rows is None else mosaic.draw(change.rows)
-        playback.advance(change.prediction, change.differences, mosaic, picture)
+def play(stored, tolerance=EXACT, *, channels=None):
+    """Every frame of a segment after its key, by way of pictures; without planes for all but `channels`."""
+    count, width = stored.xyz.shape[1], 6 + stored.key.attributes.shape[1]
+    mosaic = Mosaic.of(count, tuple(range(width)) if channels is None else channels, width, flagged=True)
+    playback = Playback(Codes(stored.key.xyz.copy(), stored.key.attributes.copy()), count, tolerance)
+    for change, sent in changes(stored, tolerance):
+        picture = mosaic.draw(change.rows, change.toggled)
+        held = playback.toggle(mosaic.read_flags(picture, count)) if change.prediction != REPEAT else 0
+        rows = mosaic.read(picture, np.full(width, NEUTRAL, np.uint8), held)
+        playback.advance(change.prediction, change.differences, rows)
+        assert same(playback.codes[:count], sent)
         yield playback.codes
 
 
 @settings(max_examples=30, deadline=None)
 @given(segments)
 def test_changes_give_back_every_code(segment):
-    stored = in_storage_order(segment)
-    mosaic = full_mosaic(stored.xyz.shape[1], 6 + stored.key.attributes.shape[1])
-    for index, codes in enumerate(play(stored, mosaic), start=1):
+    stored = in_stored_order(segment)
+    for index, codes in enumerate(play(stored), start=1):
         assert same(codes, stored.frame(index))
 
 
@@ -166,14 +120,70 @@ def test_changes_give_back_every_code(segment):
 @given(segments, st.integers(0, 5))
 def test_channels_that_never_change_need_no_plane(segment, frozen):
     segment.attributes[:, :, frozen] = segment.key.attributes[segment.dynamic, frozen]
-    stored = in_storage_order(segment)
+    stored = in_stored_order(segment)
     changing = changing_channels(stored)
     assert not changing[6 + frozen]
-    mosaic = Mosaic.of(stored.xyz.shape[1], tuple(np.flatnonzero(changing).tolist()) or (0,), len(changing))
-    for index, codes in enumerate(play(stored, mosaic), start=1):
+    channels = tuple(np.flatnonzero(changing).tolist()) or (0,)
+    for index, codes in enumerate(play(stored, channels=channels), start=1):
         assert same(codes, stored.frame(index))
-    for change in changes(stored):
-        assert change.rows is None or (change.rows[:, ~changing] == NEUTRAL).all()
+    for change, _ in changes(stored, EXACT):
+        assert (change.rows[:, ~changing] == NEUTRAL).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(segments)
+def test_only_rows_that_change_are_stored(segment):
+    stored = in_stored_order(segment)
+    count, held = stored.xyz.shape[1], np.zeros(stored.xyz.shape[1], bool)
+    for index, (change, _) in enumerate(changes(stored, EXACT), start=1):
+        if change.prediction == REPEAT:
+            assert same(stored.frame(index), stored.frame(index - 1))
+            assert not change.toggled.any()
+            continue
+        held ^= change.toggled.astype(bool)
+        assert len(change.rows) == held.sum()
+        assert (change.rows != NEUTRAL).any(axis=1).all()
+        before, after = (stored.frame(k)[:count] for k in (index - 1, index))
+        same_rows = (before.xyz == after.xyz).all(axis=1) & (before.attributes == after.attributes).all(axis=1)
+        if change.prediction == PREVIOUS:
+            assert np.array_equal(held, ~same_rows)
+
+
+tolerances = st.builds(Tolerance, st.sampled_from([0, 1, 16, 300, 8192]), st.sampled_from([0, 1, 3, 32]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(segments, tolerances)
+def test_no_code_errs_by_more_than_the_tolerance_and_presence_never(segment, tolerance):
+    stored = in_stored_order(segment)
+    for index, codes in enumerate(play(stored, tolerance), start=1):
+        wanted = stored.frame(index)
+        assert np.abs(codes.xyz.astype(int) - wanted.xyz).max(initial=0) <= tolerance.position
+        assert np.abs(codes.attributes.astype(int) - wanted.attributes).max(initial=0) <= tolerance.attribute
+        assert np.array_equal(codes.attributes[:, OPACITY] == 0, wanted.attributes[:, OPACITY] == 0)
+        still = ~stored.dynamic
+        assert same(codes[still], wanted[still])
+
+
+def test_a_tolerance_stores_less():
+    segment = in_stored_order(random_segment(0, 2000, 2000, 6))
+    bits = [
+        sum(entropy_bits(change.rows) for change, _ in changes(segment, tolerance))
+        for tolerance in (EXACT, Tolerance(4), Tolerance(4, 1), Tolerance(64, 3))
+    ]
+    assert bits == sorted(bits, reverse=True)
+    assert bits[-1] < 0.6 * bits[0]
+
+
+def test_what_wanders_within_the_tolerance_is_not_stored():
+    walk = moving([3, -2, 1, -4])
+    assert [change.prediction for change, _ in changes(walk, Tolerance(position=5))] == [REPEAT] * 4
+
+
+@pytest.mark.parametrize(("position", "attribute"), [(-1, 0), (0, -1), (8193, 0), (0, 33)])
+def test_a_tolerance_is_checked(position, attribute):
+    with pytest.raises(ValueError, match="a tolerance must be 0 to 8192"):
+        Tolerance(position, attribute)
 
 
 def moving(steps, present=None):
@@ -186,8 +196,12 @@ def moving(steps, present=None):
     return Segment(0, Codes(xyz[0], attributes[0]), np.ones(1, bool), xyz[1:], attributes[1:])
 
 
+def coded(segment) -> list[Change]:
+    return [change for change, _ in changes(segment, EXACT)]
+
+
 def test_steady_motion_is_predicted():
-    first, *others = changes(moving([40, 40, 40, 40]))
+    first, *others = coded(moving([40, 40, 40, 40]))
     assert first.prediction == PREVIOUS
     assert all(change.prediction in (PREVIOUS, LINEAR) for change in others)
     crowd = moving([40, 40, 40, 40])
@@ -195,14 +209,14 @@ def test_steady_motion_is_predicted():
     xyz = (crowd.key.xyz + steps * np.arange(5)[:, None, None]).astype(np.uint16)
     attributes = np.full((5, 50, 10), 7, np.uint8)
     segment = Segment(0, Codes(xyz[0], attributes[0]), np.ones(50, bool), xyz[1:], attributes[1:])
-    _, *others = changes(segment)
+    _, *others = coded(segment)
     for change in others:
         assert change.prediction == LINEAR
-        assert (change.rows == NEUTRAL).all()
+        assert not len(change.rows)
 
 
 def test_a_frame_in_which_nothing_changes_stores_nothing():
-    predictions = [change.prediction for change in changes(moving([5, 0, 0, 9]))]
+    predictions = [change.prediction for change in coded(moving([5, 0, 0, 9]))]
     assert predictions[1:3] == [REPEAT, REPEAT]
     assert predictions[0] != REPEAT
     assert predictions[3] != REPEAT
@@ -215,20 +229,22 @@ def test_colours_that_change_together_are_stored_as_differences():
     attributes = key.attributes.copy()
     attributes[:, 7:10] += light
     segment = Segment(0, key, np.ones(2000, bool), key.xyz[None], attributes[None])
-    (change,) = changes(segment)
+    (change,) = coded(segment)
     assert change.differences
     assert (change.rows[:, [13, 15]] == NEUTRAL).all()
-    (codes,) = play(in_storage_order(segment), full_mosaic(2000, 16))
-    assert same(codes, in_storage_order(segment).frame(1))
+    (codes,) = play(in_stored_order(segment))
+    assert same(codes, in_stored_order(segment).frame(1))
 
 
 def test_after_a_repeat_nothing_moves_on():
-    mosaic, segment = full_mosaic(1, 16), moving([40, 40])
-    playback = Playback(segment.key, 1)
-    first, _ = changes(segment)
-    playback.advance(first.prediction, first.differences, mosaic, mosaic.draw(first.rows))
-    playback.advance(REPEAT, False, mosaic, None)
-    playback.advance(LINEAR, False, mosaic, mosaic.blank())
+    segment = moving([40, 40])
+    playback = Playback(segment.key, 1, EXACT)
+    first, _ = coded(segment)
+    playback.toggle(first.toggled)
+    playback.advance(first.prediction, first.differences, first.rows)
+    playback.advance(REPEAT, False, first.rows[:0])
+    playback.toggle(first.toggled)
+    playback.advance(LINEAR, False, first.rows[:0])
     assert playback.codes.xyz[0].tolist() == [30040] * 3
 
 
@@ -256,12 +272,15 @@ def test_holding_absent_rows_changes_nothing_that_is_seen(segment):
 @settings(max_examples=30, deadline=None)
 @given(segments)
 def test_held_rows_store_nothing_but_their_opacity_while_absent(segment):
-    stored = in_storage_order(hold_absent(segment))
+    stored = in_stored_order(hold_absent(segment))
     count = stored.xyz.shape[1]
-    for frame, change in enumerate(changes(stored), start=1):
+    held = np.zeros(count, bool)
+    for frame, change in enumerate(coded(stored), start=1):
+        held ^= change.toggled.astype(bool)
         then, now = (stored.frame(t).attributes[:count, OPACITY] > 0 for t in (frame - 1, frame))
-        if change.rows is not None and not change.differences:
-            others = np.delete(change.rows, 6 + OPACITY, axis=1)
+        if change.prediction != REPEAT and not change.differences:
+            others = np.full((count, 5 + stored.key.attributes.shape[1]), NEUTRAL)
+            others[held] = np.delete(change.rows, 6 + OPACITY, axis=1)
             assert (others[~now] == NEUTRAL).all()
             ever = np.array([stored.frame(t).attributes[:count, OPACITY] for t in range(frame)]).any(axis=0)
             assert (others[now & ~then & ~ever] == NEUTRAL).all()  # born with what the row already held

@@ -29,6 +29,18 @@ from pipelines.run import request_from
         (["run", "capture", "--out", "o", "--dir"], "unrecognized arguments: --dir"),
         (["sync", "capture", "--out", "o", "--stop-after", "fit"], "unrecognized arguments: --stop-after fit"),
         (["simulate", "out", "--size", "640"], "must be WIDTHxHEIGHT in pixels"),
+        (["export"], "the following arguments are required: WHAT; see packuv export --help"),
+        (["export", "nowhere.mkv", "-o", "a.ply"], "one of the arguments --frame --frames is required"),
+        (["export", "nowhere.mkv", "--frame", "0", "-o", "a.ply"], "nowhere.mkv"),
+        (["export", "frames", "nowhere.mkv", "--frame", "0", "-o", "a.txt"], "a.txt does not tell its format"),
+        (["export", "cameras", "a.mkv", "-o", "out"], "the following arguments are required: --to"),
+        (["export", "atlas", "a.mkv", "-o", "b.mkv", "--codec", "ffv1", "--crf", "9"], "ffv1 is always lossless"),
+        (["export", "atlas", "a.mkv", "-o", "b.mkv", "--lossless", "--crf", "9"], "not allowed with argument"),
+        (["export", "atlas", "a.mkv", "-o", "b.mkv", "--map", "100"], "choose multiples"),
+        (["import", "nowhere.ply", "-o", "a.mkv"], "no splat file or folder nowhere.ply"),
+        (["import", "a.ply", "--fps", "0", "-o", "a.mkv"], "must be a rate above 0 as 30, 29.97 or 30000/1001"),
+        (["atlas", "nowhere.mkv", "--frame", "0", "-o", "a.png"], "nowhere.mkv"),
+        (["web", "nowhere.mkv", "-o", "site"], "nowhere.mkv"),
         (["verify"], "one of the arguments SCENE --store is required"),
         (["run", "nowhere", "--out", "o"], "no capture folder nowhere"),
         (["run", "nowhere", "--out", "o", "--set", "fit.iterations"], "--set needs NAME=VALUE"),
@@ -48,11 +60,17 @@ def test_wrong_usage_is_one_sentence_and_code_2(arguments, message, capsys, tmp_
 
 
 @pytest.mark.parametrize(
-    "command", ["", *cli.SINGLE, "run", "simulate", "info", "verify", "export", "render", "eval", "view"]
+    "command",
+    [
+        "",
+        *cli.SINGLE,
+        *("run", "simulate", "info", "verify", "render", "eval", "view", "import", "atlas", "web"),
+        *("export", "export frames", "export cameras", "export atlas"),
+    ],
 )
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as leaving:
-        main([command, "--help"] if command else ["--help"])
+        main([*command.split(), "--help"])
     assert leaving.value.code == OK
     text = capsys.readouterr().out
     assert f"usage: packuv {command}".strip() in text

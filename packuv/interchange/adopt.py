@@ -1,0 +1,311 @@
+"""Splat files of other programs become a scene file, and the loss is told.
+
+One file is a still scene, several are the frames of a sequence. Post-hoc UV mapping drops Gaussians, as the paper
+warns: a map that was not trained for them has too few texels where they crowd.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from packuv.interchange import is_splats, read_gaussians
+from packuv.interchange.conventions import drawn
+from packuv.interchange.orbit import OrbitOptions, likeness, near_of, orbit
+from packuv.interchange.rows import equal_codes, segments_of
+from packuv.model import canonical, rows_of
+from packuv.quantize import OPACITY, OPACITY_RANGE, SCALE, Codes, Gaussians, Quantizer, attribute_values
+from packuv.scene import SceneHeader, open_scene, write_scene
+from packuv.segment import Segment
+from packuv.uvmap import UvOptions, assign_slots, choose_centre
+
+TAIL = 5e-5
+"""Share of the values at either end of a column that its range need not hold; one stray value would coarsen all. With
+ten times as much, pictures of a fitted scene came 6 to 20 dB worse."""
+ROTATION_REACH = 0.7072
+"""x, y and z of a canonical rotation are at most the square root of one half."""
+
+Progress = Callable[[int, int], None]
+"""Called with (steps done, steps in all)."""
+
+
+@dataclass(frozen=True)
+class AdoptOptions:
+    """How splat files become a scene."""
+
+    uv: UvOptions | None = field(default_factory=UvOptions)
+    """The UV map that bounds the number of Gaussians; None keeps them all, which the compact layout allows"""
+    rate: Fraction = Fraction(30)
+    """Frames per second of a sequence"""
+    segment_frames: int = 30
+    """Longest segment; memory grows with it"""
+    sh_degree: int | None = None
+    """Highest SH degree to keep; None keeps what the files have"""
+    orbit: OrbitOptions = field(default_factory=OrbitOptions)
+    """Views from which the loss is measured; they become the scene's cameras"""
+    compared_frames: int = 3
+    """Frames of a sequence whose pictures are compared, evenly spread; 0 to compare none"""
+
+    def __post_init__(self) -> None:
+        if self.segment_frames < 1 or self.orbit.cameras < 1 or not self.rate > 0:
+            raise ValueError(f"a scene needs frames in its segments, a camera and a rate above 0, but has {self}")
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"a scene holds SH of degree 0 to 3, but {self.sh_degree} is asked for")
+
+
+@dataclass(frozen=True)
+class AdoptReport:
+    """What came over, and what was lost."""
+
+    frames: int
+    segments: int
+    bytes: int
+    """Size of the scene file"""
+    gaussians: int
+    """Of all frames together, in the files"""
+    undrawn: int
+    """Of these, broken (not finite, or without a rotation) or fainter than any renderer draws"""
+    pruned: int
+    """Of the rest, for which the UV map had no texel"""
+    kept_share: float
+    """Share of the drawn Gaussians that the scene holds"""
+    kept_alpha_share: float
+    """The same, each counted by its alpha"""
+    saturated: int
+    """Values of the first frame beyond the range of their codes"""
+    psnr_pruned_db: tuple[float, ...]
+    """Of every view of the frames compared, before the codes: the cost of pruning alone; infinite if none"""
+    psnr_db: tuple[float, ...]
+    """The same of the finished file"""
+
+    def to_json(self) -> dict[str, Any]:
+        """PSNR of equal pictures is null."""
+        decibels = {key: [v if np.isfinite(v) else None for v in getattr(self, key)] for key in _PSNR}
+        return {**vars(self), **decibels}
+
+
+_PSNR = ("psnr_pruned_db", "psnr_db")
+
+
+def find_frames(inputs: Sequence[Path]) -> list[Path]:
+    """The splat files that are meant, one a frame: files as named, folders by their files in natural order.
+
+    Raises FileNotFoundError, or ValueError for a folder without splat files or with several kinds.
+    """
+    found: list[Path] = []
+    for path in map(Path, inputs):
+        if not path.exists():
+            raise FileNotFoundError(f"no splat file or folder {path}")
+        found += [path] if is_splats(path) or not path.is_dir() else _in_folder(path)
+    return found
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    files = sorted((path for path in folder.iterdir() if is_splats(path)), key=_natural)
+    kinds = sorted({path.suffix.lower() for path in files})
+    if len(kinds) != 1:
+        raise ValueError(f"a folder of frames holds splat files of one kind, but {folder} has {kinds or 'none'}")
+    return files
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Numbers in names count as numbers: frame 9 comes before frame 10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress: Progress | None = None) -> AdoptReport:
+    """Write a scene file of splat files, one a frame, and tell what was lost.
+
+    Every file is read twice, at most one segment is in memory. Raises ValueError for files without a drawn Gaussian or
+    of different SH degrees, FileNotFoundError for missing ones.
+    """
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"no folder {out.parent} to write {out.name} in; make it first")
+    report = progress or (lambda done, total: None)
+    count, steps = len(frames), 4 * len(frames)  # survey, map, encode, verify
+    survey = _Survey(options)
+    for done, path in enumerate(frames, start=1):
+        survey.add(path)
+        report(done, steps)
+    header = _header(survey, frames, options)
+    mapper = _Mapper(header.quantizer, options)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}.") as folder:
+        coded = _coded(frames, header.quantizer, options, lambda done: report(count + done, steps))
+        parts: list[Path] = []
+        for segment in segments_of(coded, longest=options.segment_frames):
+            parts.append(Path(folder, f"{len(parts):05d}.npz"))
+            mapper.keep(segment).save(parts[-1])
+        summary = write_scene(out, parts, header, progress=lambda done, _: report(2 * count + done, steps))
+    pruned, finished = _compare(frames, out, options)
+    drawn_count = survey.count - survey.undrawn
+    return AdoptReport(
+        count, len(parts), summary.bytes, survey.count, survey.undrawn, drawn_count - mapper.kept,
+        mapper.kept / drawn_count, mapper.kept_alpha / mapper.alpha, header.quantizer.saturation(survey.first),
+        tuple(pruned), tuple(finished),
+    )  # fmt: skip
+
+
+def _header(survey: _Survey, frames: Sequence[Path], options: AdoptOptions) -> SceneHeader:
+    """Ranges of all frames, regular times, and the cameras of the orbit."""
+    cameras = orbit(survey.first, options=options.orbit)
+    times = np.array([round(index * 10**9 / options.rate) for index in range(len(frames))], dtype=np.int64)
+    source = {"files": len(frames), "first": frames[0].name, "uv": None if options.uv is None else vars(options.uv)}
+    extra = {"near": near_of(cameras), "adopted": source}
+    return SceneHeader(survey.quantizer(), times, options.rate, cameras, extra=extra)
+
+
+def read_frame(path: Path, *, sh_degree: int | None) -> tuple[Gaussians, int]:
+    """The Gaussians of a file that a renderer draws, in canonical form, and the number of the others."""
+    whole = read_gaussians(path)
+    if sh_degree is not None and whole.sh_degree > sh_degree:
+        whole = replace(whole, sh=np.ascontiguousarray(whole.sh[:, : (sh_degree + 1) ** 2]))
+    values = (whole.means, whole.log_scales, whole.quaternions, whole.opacity_logits[:, None], whole.sh)
+    sound = np.logical_and.reduce([np.isfinite(v).all(axis=tuple(range(1, v.ndim))) for v in values])
+    kept = drawn(rows_of(whole, sound & whole.quaternions.any(axis=1)))
+    return canonical(kept), len(whole) - len(kept)
+
+
+class _Survey:
+    """First pass: ranges of all values over all frames."""
+
+    def __init__(self, options: AdoptOptions) -> None:
+        self._options = options
+        self.first: Gaussians
+        self.count = self.undrawn = 0
+        self._low = self._high = np.empty(0)
+        self._least = self._most = np.empty(0)
+
+    def add(self, path: Path) -> None:
+        frame, undrawn = read_frame(path, sh_degree=self._options.sh_degree)
+        if not len(frame):
+            raise ValueError(f"{path} holds no Gaussians that can be drawn; leave it out")
+        values = attribute_values(frame)
+        low, high = np.quantile(values, [TAIL, 1 - TAIL], axis=0)
+        high[SCALE] = values[:, SCALE].max(axis=0)  # the few largest Gaussians cover much of the picture
+        least, most = frame.means.min(axis=0), frame.means.max(axis=0)
+        if not self.count:
+            self.first, self._low, self._high, self._least, self._most = frame, low, high, least, most
+        elif len(low) != len(self._low):
+            raise ValueError(f"{path} has SH of degree {frame.sh_degree}, the first file {self.first.sh_degree}; "
+                             "frames need one degree, choose it with --sh-degree")  # fmt: skip
+        self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+        self._least, self._most = np.minimum(self._least, least), np.maximum(self._most, most)
+        self.count += len(frame) + undrawn
+        self.undrawn += undrawn
+
+    def quantizer(self) -> Quantizer:
+        """Ranges that hold all but the tails; the axes of the scale share one, the colours of an SH coefficient too."""
+        low, high = self._low.astype(np.float64), self._high.astype(np.float64)
+        for group in (slice(0, 3), *(slice(k, k + 3) for k in range(OPACITY + 1, len(low), 3))):
+            low[group], high[group] = low[group].min(), high[group].max()
+        high = np.maximum(high, low + 1e-3)
+        low[3:6], high[3:6] = -ROTATION_REACH, ROTATION_REACH
+        low[OPACITY], high[OPACITY] = OPACITY_RANGE
+        centre = self._centre()
+        distance = np.maximum(np.abs(self._least - centre), np.abs(self._most - centre)).astype(np.float64)
+        typical = float(np.median(np.linalg.norm(self.first.means - centre, axis=1)))
+        unit = 0.5 * max(typical, 1e-6)
+        return Quantizer(centre, unit, 1.001 * np.maximum(distance, unit), low, high, self.first.sh_degree)
+
+    def _centre(self) -> np.ndarray:
+        alpha = 1 / (1 + np.exp(-self.first.opacity_logits))
+        return choose_centre(self.first.means, alpha, options=self._options.uv or UvOptions())
+
+
+def _coded(
+    frames: Sequence[Path], quantizer: Quantizer, options: AdoptOptions, progress: Callable[[int], None]
+) -> Iterator[Codes]:
+    """Second pass: the codes of every frame. A drawn Gaussian never gets opacity code 0, which means absent."""
+    for done, path in enumerate(frames, start=1):
+        codes = quantizer.encode(read_frame(path, sh_degree=options.sh_degree)[0])
+        codes.attributes[:, OPACITY] = np.maximum(codes.attributes[:, OPACITY], 1)
+        yield codes
+        progress(done)
+
+
+class _Mapper:
+    """Gives the rows of segments slots in the UV map, and counts what finds none."""
+
+    def __init__(self, quantizer: Quantizer, options: AdoptOptions) -> None:
+        self._quantizer, self._uv = quantizer, options.uv
+        logits = quantizer.attribute_table[OPACITY].astype(np.float64)
+        self._alpha = np.where(np.arange(256) > 0, 1 / (1 + np.exp(-logits)), 0.0)  # [256]
+        self.kept = 0
+        self.kept_alpha = self.alpha = 0.0
+
+    def keep(self, segment: Segment) -> Segment:
+        """The segment without the rows that the map has no texel for, seen where and as opaque as they first appear."""
+        rows = np.ones(len(segment.key), bool)
+        codes = first_appearance(segment)
+        if self._uv is not None:
+            points = self._quantizer.decode(codes).means
+            opacity = codes.attributes[:, OPACITY]
+            rows = assign_slots(points, opacity, self._quantizer.centre, options=self._uv).kept
+        self._count(segment, rows)
+        return with_rows(segment, rows)
+
+    def _count(self, segment: Segment, rows: np.ndarray) -> None:
+        """Every drawn Gaussian of every frame counts."""
+        still, moving = rows[~segment.dynamic], rows[segment.dynamic]
+        base = segment.key.attributes[~segment.dynamic, OPACITY]
+        changing = segment.key.attributes[None, segment.dynamic, OPACITY]
+        for opacity, kept, times in (
+            (base[None], still, len(segment)),
+            (np.concatenate([changing, segment.attributes[:, :, OPACITY]]), moving, 1),
+        ):
+            alpha = self._alpha[opacity]
+            self.kept += times * int((opacity[:, kept] > 0).sum())
+            self.kept_alpha += times * float(alpha[:, kept].sum())
+            self.alpha += times * float(alpha.sum())
+
+
+def first_appearance(segment: Segment) -> Codes:
+    """The codes of each row in the first frame that draws it; rows that none draws keep their key."""
+    xyz, attributes = segment.key.xyz.copy(), segment.key.attributes.copy()
+    moving = np.flatnonzero(segment.dynamic)
+    waiting = attributes[moving, OPACITY] == 0
+    for frame_xyz, frame_attributes in zip(segment.xyz, segment.attributes, strict=True):
+        here = waiting & (frame_attributes[:, OPACITY] > 0)
+        xyz[moving[here]], attributes[moving[here]] = frame_xyz[here], frame_attributes[here]
+        waiting &= ~here
+    return Codes(xyz, attributes)
+
+
+def with_rows(segment: Segment, rows: np.ndarray) -> Segment:
+    """Only the rows of a mask, bool [N]."""
+    moving = rows[segment.dynamic]
+    return Segment(
+        segment.first, segment.key[rows], segment.dynamic[rows], segment.xyz[:, moving], segment.attributes[:, moving]
+    )
+
+
+def _compare(frames: Sequence[Path], out: Path, options: AdoptOptions) -> tuple[list[float], list[float]]:
+    """PSNR of what pruning left, and of the finished file, over frames and views."""
+    pruned: list[float] = []
+    finished: list[float] = []
+    if not options.compared_frames:
+        return pruned, finished
+    with open_scene(out) as scene:
+        near = float(scene.header.extra["near"])
+        for frame in np.unique(np.linspace(0, len(frames) - 1, options.compared_frames).round().astype(int)):
+            truth, _ = read_frame(frames[frame], sh_degree=options.sh_degree)
+            stored = scene.codes(int(frame))
+            stored = stored[stored.attributes[:, OPACITY] > 0]
+            quantizer, cameras = scene.header.quantizer, scene.header.cameras
+            pruned += likeness(truth, _left_of(truth, stored, quantizer), cameras, near=near)
+            finished += likeness(truth, quantizer.decode(stored), cameras, near=near)
+    return pruned, finished
+
+
+def _left_of(truth: Gaussians, stored: Codes, quantizer: Quantizer) -> Gaussians:
+    """The Gaussians whose codes are stored, with the values that they had before."""
+    codes = quantizer.encode(truth)
+    codes.attributes[:, OPACITY] = np.maximum(codes.attributes[:, OPACITY], 1)
+    return rows_of(truth, np.flatnonzero(equal_codes(codes, stored) >= 0))

@@ -1,0 +1,206 @@
+"""Niantic's SPZ: 20 bytes a Gaussian and 3 for each SH coefficient above band 0, then gzip or zstd.
+
+Versions 1 to 3 are one gzip stream behind a header of 16 bytes; version 4 has a plain header of 32 bytes and one zstd
+stream an attribute. Inside, x points right, y up and z back (RUB); splat files and ours have y down and z forward
+(RDF), so that y and z change sign on the way, and with them parts of the rotations and SH bands. Written is version 3,
+which all readers of the format know.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from packuv.interchange.conventions import (
+    alpha_codes,
+    drawn,
+    drop_largest,
+    logits_of_alpha,
+    restore_largest,
+)
+from packuv.quantize import Gaussians
+from packuv.whole import whole_file
+
+MAGIC = b"NGSP"
+HEADER = struct.Struct("<4sIIBBBB")
+"""Magic, version, count, SH degree, fractional bits, flags, and the number of streams (version 4)."""
+V4_HEADER_BYTES, V4_ENTRY = 32, struct.Struct("<QQ")
+HAS_EXTENSIONS = 2
+"""Flag; the only extension that changes how values are read is Adobe's range of SH values."""
+COLOUR_SCALE = 0.15
+"""SH band 0 is stored as 0.5 + COLOUR_SCALE * value, which leaves room beyond black and white."""
+MOST_FRACTIONAL_BITS = 20
+"""Positions are 24-bit fixed point; finer steps than 2^-20 exceed what float32 means in a scene of some metres."""
+SH_STEPS = (8, 16)
+"""Step of the SH codes written in band 1, and in the bands above, as the format's own library has it."""
+
+_FLIP_POINT = np.array([1, -1, -1])
+_FLIP_ROTATION = np.array([1, 1, -1, -1])  # of w x y z: y and z flipped is a half turn about x
+_FLIP_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
+"""Sign of each coefficient above band 0 under y -> -y, z -> -z: those of odd degree in y z together."""
+
+
+def write_spz(path: Path, gaussians: Gaussians) -> int:
+    """Write an SPZ file of version 3 and return the number of Gaussians in it; what is not drawn is left out.
+
+    Positions get as many fractional bits as the scene's extent allows. Raises ValueError where even whole units do
+    not reach.
+    """
+    kept = drawn(gaussians)
+    bits = _fractional_bits(kept.means)
+    points = np.rint(kept.means.astype(np.float64) * _FLIP_POINT * 2**bits).astype("<i4")
+    rotation = (kept.quaternions * _FLIP_ROTATION)[:, [1, 2, 3, 0]]  # x y z w
+    colours = kept.sh[:, 0].astype(np.float64) * (COLOUR_SCALE * 255) + 127.5
+    streams = [
+        points.reshape(-1, 1).view("u1")[:, :3],
+        alpha_codes(kept.opacity_logits),
+        _byte(colours),
+        _byte((kept.log_scales.astype(np.float64) + 10) * 16),
+        _pack_rotation(rotation),
+        _pack_bands(kept.sh[:, 1:]),
+    ]
+    header = HEADER.pack(MAGIC, 3, len(kept), kept.sh_degree, bits, 0, 0)
+    body = header + b"".join(np.ascontiguousarray(stream).tobytes() for stream in streams)
+    with whole_file(path) as partial:
+        partial.write_bytes(gzip.compress(body, 6, mtime=0))  # no date: same scene, same bytes
+    return len(kept)
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Gaussians of an SPZ file, versions 1 to 4, turned to the axes of splat files (y down, z forward).
+
+    Raises ValueError for what is no SPZ file, is damaged, or holds SH of a degree above 3 or a range of their own.
+    """
+    data = Path(path).read_bytes()
+    try:
+        header, streams = _open(data)
+        return _gaussians(header, streams)
+    except (EOFError, OSError, zlib.error, struct.error) as error:
+        raise ValueError(f"{path} is no SPZ file, or damaged: {error}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+@dataclass(frozen=True)
+class _Header:
+    version: int
+    count: int
+    degree: int
+    fractional_bits: int
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes of the streams: positions, alphas, colours, scales, rotations, SH."""
+        per_row = (6 if self.version == 1 else 9, 1, 3, 3, 3 if self.version < 3 else 4)
+        return tuple(n * self.count for n in (*per_row, 3 * ((self.degree + 1) ** 2 - 1)))
+
+
+def _open(data: bytes) -> tuple[_Header, list[np.ndarray]]:
+    """Header, and the streams as bytes."""
+    packed = data[:2] == b"\x1f\x8b"
+    data = gzip.decompress(data) if packed else data
+    magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(data)
+    if magic != MAGIC or not 1 <= version <= 4 or (version == 4) == packed:
+        raise ValueError(f"an SPZ file starts with {MAGIC!r} and version 1 to 4, this one with {magic!r} and {version}")
+    if degree > 3:
+        raise ValueError(f"it has SH of degree {degree}, but a scene holds 3 at most; convert it to a lower degree")
+    if flags & HAS_EXTENSIONS:
+        raise ValueError("it has extensions, which may change what its numbers mean; write it without them")
+    header = _Header(version, count, degree, bits)
+    if version == 4:
+        return header, _zstd_streams(data, header, streams)
+    return header, _cut(data[HEADER.size :], header)
+
+
+def _cut(body: bytes, header: _Header) -> list[np.ndarray]:
+    ends = np.cumsum(header.sizes)
+    if len(body) < ends[-1]:
+        raise ValueError(f"{header.count} Gaussians take {ends[-1]} bytes, but {len(body)} are there; it is cut short")
+    return np.split(np.frombuffer(body, np.uint8)[: ends[-1]], ends[:-1])
+
+
+def _zstd_streams(data: bytes, header: _Header, count: int) -> list[np.ndarray]:
+    """Streams of version 4: a table of packed and plain sizes, then the streams; empty ones are left out."""
+    (table,) = struct.unpack_from("<I", data, HEADER.size)
+    wanted = [size for size in header.sizes if size]
+    if table < V4_HEADER_BYTES or count != len(wanted):
+        raise ValueError(f"its {len(wanted)} streams cannot be found ({count} in a table at byte {table})")
+    at, body = table + count * V4_ENTRY.size, b""
+    for number, size in enumerate(wanted):
+        packed, plain = V4_ENTRY.unpack_from(data, table + number * V4_ENTRY.size)
+        if plain != size or at + packed > len(data):
+            raise ValueError(f"stream {number} must hold {size} bytes, but is said to hold {plain}, or is cut short")
+        body += pa.decompress(data[at : at + packed], size, "zstd", asbytes=True)
+        at += packed
+    return _cut(body, header)
+
+
+def _gaussians(header: _Header, streams: list[np.ndarray]) -> Gaussians:
+    points, alphas, colours, scales, rotations, bands = streams
+    n = header.count
+    dc = (colours.reshape(n, 1, 3) / 255 - 0.5) / COLOUR_SCALE
+    higher = (bands.reshape(n, (header.degree + 1) ** 2 - 1, 3) - 128.0) / 128
+    sh = np.concatenate([dc, higher * _FLIP_SH[: higher.shape[1], None]], axis=1)
+    return Gaussians(
+        (_points(points, header) * _FLIP_POINT).astype(np.float32),
+        (scales.reshape(n, 3) / 16 - 10).astype(np.float32),
+        _unpack_rotation(rotations.reshape(n, 3 if header.version < 3 else 4))[:, [3, 0, 1, 2]]
+        * _FLIP_ROTATION.astype(np.float32),
+        logits_of_alpha(alphas),
+        sh.astype(np.float32),
+    )
+
+
+def _points(stream: np.ndarray, header: _Header) -> np.ndarray:
+    """float64 [n, 3], RUB."""
+    if header.version == 1:
+        return stream.view("<f2").reshape(-1, 3).astype(np.float64)
+    wide = np.zeros((3 * header.count, 4), np.uint8)
+    wide[:, 1:] = stream.reshape(-1, 3)  # in the upper bytes, so that the shift back carries the sign
+    return (wide.view("<i4").reshape(-1, 3) >> 8) / 2.0**header.fractional_bits
+
+
+def _fractional_bits(means: np.ndarray) -> int:
+    reach = float(np.abs(means).max(initial=0))
+    if not reach < 2**23 - 1:
+        raise ValueError(f"SPZ holds positions up to {2**23 - 1} units from the origin, but the scene reaches {reach}")
+    return min(MOST_FRACTIONAL_BITS, 23 - math.ceil(math.log2(max(reach, 1) + 1)))
+
+
+def _byte(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _pack_rotation(rotation: np.ndarray) -> np.ndarray:
+    """x y z w [n, 4] as uint32 [n]: 2 bits name the largest component; the others take a sign and 9 bits each."""
+    largest, others = drop_largest(rotation)
+    size = np.minimum(np.rint(np.abs(others) * math.sqrt(2) * 511), 511).astype(np.uint32)
+    codes = (others < 0).astype(np.uint32) << np.uint32(9) | size
+    packed = largest.astype(np.uint32)
+    for column in codes.T:
+        packed = packed << np.uint32(10) | column
+    return packed.astype("<u4")
+
+
+def _unpack_rotation(stream: np.ndarray) -> np.ndarray:
+    """Quaternions float32 [n, 4], x y z w."""
+    if stream.shape[1] == 3:  # versions 1 and 2: x y z of a quaternion whose w >= 0
+        return restore_largest(np.full(len(stream), 3), stream / 127.5 - 1)
+    packed = np.ascontiguousarray(stream).view("<u4")[:, 0].astype(np.int64)
+    codes = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1)
+    others = np.where(codes >> 9, -1, 1) * (codes & 511) / (511 * math.sqrt(2))
+    return restore_largest(packed >> 30, others)
+
+
+def _pack_bands(sh: np.ndarray) -> np.ndarray:
+    """Coefficients above band 0 [n, k, 3] as bytes around 128, rounded to steps of which 128 is one."""
+    step = np.where(np.arange(sh.shape[1]) < 3, *SH_STEPS)[:, None]
+    signed = sh.astype(np.float64) * _FLIP_SH[: sh.shape[1], None]
+    return _byte(np.rint(signed * 128 / step) * step + 128)
