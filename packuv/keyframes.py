@@ -49,7 +49,13 @@ class KeyframeOptions:
     prominence: float = 0.1
     """How far a peak must rise above the valleys on its sides, share of the highest M(t)"""
 
+    promotion: float = 1.6
+    """A frame whose loss after its fit exceeds that of its segment's first half `separation` of frames by this factor
+    becomes a keyframe: something came into view, or the chain has drifted; 0: never"""
+
     def __post_init__(self) -> None:
+        if self.promotion != 0 and not self.promotion > 1:
+            raise ValueError(f"promotion must be a factor above 1, or 0 for never, but is {self.promotion}")
         if self.smoothing < 1 or self.smoothing % 2 == 0 or self.separation < 1 or (self.peaks or 0) < 0:
             raise ValueError(
                 "smoothing must be odd and positive, separation positive and peaks not negative, but they are "
@@ -118,6 +124,22 @@ def segments(keyframes: Sequence[Keyframe], count: int) -> list[range]:
     if not starts or starts[0] != 0 or starts[-1] >= count or any(np.diff(starts) <= 0):
         raise ValueError(f"keyframes must ascend from 0 and stay below {count}, but are {starts}")
     return [range(first, last) for first, last in zip(starts, [*starts[1:], count], strict=True)]
+
+
+def promoted(losses: Sequence[float], options: KeyframeOptions) -> int | None:
+    """The first frame of a fitted segment that should start one of its own, or None.
+
+    `losses` are those of the frames after the keyframe, NaN where nothing moved; frames count from the keyframe, 0.
+    Both parts keep at least half of `separation`.
+    """
+    least = max(1, options.separation // 2)
+    values = np.asarray(losses, dtype=np.float64)
+    usual = values[:least][np.isfinite(values[:least])]
+    if not options.promotion or not len(usual):
+        return None
+    high = np.flatnonzero(values > options.promotion * np.median(usual)) + 1
+    high = high[(high >= least) & (high <= len(values) + 1 - least)]
+    return int(high[0]) if len(high) else None
 
 
 def fitting_order(pictures: Sequence[int]) -> tuple[int, list[tuple[int, int]]]:

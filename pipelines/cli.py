@@ -19,7 +19,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pipelines.request import PRESETS, STAGES
+from pipelines.request import PRESETS, QUALITIES, STAGES
 
 OK, FAILED, WRONG, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 SINGLE = {
@@ -172,6 +172,7 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
     command.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/")
     command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
+    command.add_argument("--quality", choices=QUALITIES, default="lossless", help="how near the file stays to the fit")
     command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what fits and renders")
     command.add_argument(
         "--frames", type=_range, default=(0, None), metavar="A:B", help="instants A to B - 1, counted from 0 (all)"

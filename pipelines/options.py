@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from packuv.encoder import TOLERANCES, Quality
 from packuv.keyframes import KeyframeOptions
 from packuv.motion import MotionOptions
 from packuv.scene import EncodeOptions
 from packuv.solver import FitOptions
-from pipelines.request import PRESETS
+from pipelines.request import PRESETS, QUALITIES
 from sync.align import AlignOptions
 from sync.capture import CaptureSettings
 from tasks.calibrate import PointOptions, RigOptions
@@ -54,13 +55,22 @@ _PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
 }
 assert tuple(_PRESETS) == PRESETS
+assert tuple(Quality) == QUALITIES
 
 
-def compose(preset: str, capture: CaptureSettings, settings: Mapping[str, Any], *, seed: int = 0) -> SequenceOptions:
+def compose(
+    preset: str,
+    capture: CaptureSettings,
+    settings: Mapping[str, Any],
+    *,
+    seed: int = 0,
+    quality: str = Quality.LOSSLESS,
+) -> SequenceOptions:
     """Options of a run: the preset's, then what capture.toml says, then the user's settings.
 
     Raises OptionError that names an unknown setting, with the valid names, or a value of the wrong kind.
     """
     options = override(SequenceOptions(), _PRESETS[preset])
     options = override(options, {"sync": {"reference": capture.reference, "clock": capture.clock}})
-    return override(override(options, {"fit": {"seed": seed}}), settings)
+    tolerance = asdict(TOLERANCES[Quality(quality)])
+    return override(override(options, {"fit": {"seed": seed}, "encode": {"tolerance": tolerance}}), settings)

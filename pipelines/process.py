@@ -12,11 +12,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pipelines.chain import Submit
 from pipelines.options import compose
 from pipelines.progress import Event, TerminalProgress
 from pipelines.request import RunRequest
 from pipelines.results import Run, collect, run_json
-from pipelines.stages import Made, Submit, run_stages
+from pipelines.stages import Made, run_stages
 from sync.capture import Capture, find_capture
 from tasks.encode import SCENE
 from tasks.jobs import Jobs
@@ -87,7 +88,7 @@ def process(request: RunRequest, progress: TerminalProgress, submit: Submit) -> 
     """
     started = datetime.now(UTC)
     capture = find_capture(Path(request.capture))
-    options = compose(request.preset, capture.settings, request.settings, seed=request.seed)
+    options = compose(request.preset, capture.settings, request.settings, seed=request.seed, quality=request.quality)
     plan = plan_of(request, capture)
     folder = Path(request.out).absolute() / capture.name
     folder.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,8 @@ from typing import Any
 from tasks.recipe import OptionError
 
 PRESETS = ("draft", "standard", "high")
+QUALITIES = ("lossless", "high", "medium", "low")
+"""How near the scene file stays to the fit, see `packuv.encoder.TOLERANCES`"""
 STAGES = ("sync", "calibrate", "flow", "fit", "encode", "verify", "evaluate", "report")
 """In the order in which a run does them"""
 
@@ -24,6 +26,8 @@ class RunRequest:
     out: str
     """Results go to <out>/<name of the sequence>/"""
     preset: str = "standard"
+    quality: str = "lossless"
+    """Of the scene file; the fit does not depend on it"""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Nested: stage -> option -> value; wins over the preset"""
     frames: tuple[int, int | None] = (0, None)
@@ -37,7 +41,13 @@ class RunRequest:
     """Fits at once; None: from the number of cores"""
 
     def __post_init__(self) -> None:
-        for name, choices in (("preset", PRESETS), ("stop_after", STAGES), ("device", ("auto", "cpu", "cuda"))):
+        choices_of = {
+            "preset": PRESETS,
+            "quality": QUALITIES,
+            "stop_after": STAGES,
+            "device": ("auto", "cpu", "cuda"),
+        }
+        for name, choices in choices_of.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, but is {getattr(self, name)!r}")
 

@@ -33,6 +33,7 @@ def request_from(arguments: argparse.Namespace) -> RunRequest:
         capture=str(arguments.capture),
         out=str(arguments.out),
         preset=arguments.preset,
+        quality=arguments.quality,
         settings=read_settings(arguments.config, arguments.set),
         frames=arguments.frames,
         hold_out=arguments.hold_out,

@@ -7,11 +7,9 @@ would keep that worker from working.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
 
-from packuv.keyframes import fitting_order
+from pipelines.chain import Chain, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
@@ -19,21 +17,10 @@ from tasks.calibrate import find_points, find_rig
 from tasks.encode import encode, verify
 from tasks.evaluate import evaluate
 from tasks.plan import Plan
-from tasks.splat import count_pictures, fit_first, fit_next, fit_segment
 from tasks.store import Key
 from tasks.synchronize import synchronize
 from tasks.track import choose_keyframes, find_motion, read_spans
 from tasks.workshop import Workshop
-
-
-class Future(Protocol):
-    """A stage under way."""
-
-    def result(self) -> Any:
-        """Wait for the stage; its artefact, or the exception that it raised."""
-
-
-Submit = Callable[..., Future]
 
 
 @dataclass
@@ -99,27 +86,7 @@ def _track(workshop: Workshop, plan: Plan, options: SequenceOptions, submit: Sub
 
 
 def _fit(workshop: Workshop, plan: Plan, options: SequenceOptions, submit: Submit, made: Made) -> None:
-    """Fit the chain of keyframes, and each segment beside it as soon as its keyframe is there.
-
-    The next keyframe is submitted before the segment, because the chain is the longest way through the work.
-    """
-    groups, points = made.only("sync"), made.only("points")
+    sources = (made.only("sync"), made.only("points"), made.only("motion"))
     spans = read_spans(workshop, made.only("keyframes"))
-    sources, settings = (workshop, plan, groups, points), (options.pictures, options.motion, options.fit)
-    instants = [span.start for span in spans]
-    anchor, steps = fitting_order(count_pictures(workshop, plan, groups, instants))
-    keys = {anchor: submit(fit_first, *sources, instants[anchor], *settings).result()}
-    segments: dict[int, Future] = {}
-
-    def start_segment(index: int) -> None:
-        parts = (made.only("motion"), keys[index], spans[index], options.pictures, options.fit)
-        segments[index] = submit(fit_segment, *sources, *parts)
-
-    last = anchor
-    for index, start in steps:
-        following = submit(fit_next, *sources, keys[start], (instants[start], instants[index]), *settings)
-        start_segment(last)
-        keys[index], last = following.result(), index
-    start_segment(last)
-    made.add(*(keys[index] for index in range(len(spans))))
-    made.add(*(segments[index].result() for index in range(len(spans))))
+    for pair in Chain(workshop, plan, options, submit, *sources).fit(spans):
+        made.add(*pair)

@@ -31,7 +31,7 @@ from tasks.report_facts import FrameScore, frames_to_picture
 from tasks.store import Key
 from tasks.workshop import Workshop
 
-VERSION = 1
+VERSION = 2
 METRICS, TABLE, PICTURES = "metrics.json", "metrics.arrow", "pictures"
 
 
@@ -64,11 +64,15 @@ class Score:
     psnr_own_db: float | None
     """Against the picture as filmed, the render with the one gain per channel that fits this picture best"""
     ssim_own: float
+    flicker: float | None
+    """Mean absolute change, since the camera's last frame, of the difference between render and truth in the rig's
+    colour: what blinks in the render but not in the truth, whatever moves. None in a first frame"""
 
 
 SCHEMA = pa.schema(
     [("frame", pa.int32()), ("time_ns", pa.int64()), ("camera", pa.string()), ("held_out", pa.bool_())]
     + [(name, pa.float64()) for kind in ("", "_rig", "_own") for name in (f"psnr{kind}_db", f"ssim{kind}")]
+    + [("flicker", pa.float64())]
 )  # fmt: skip
 
 
@@ -102,7 +106,7 @@ def build(footage: Footage, scene: Path, options: EvaluateOptions, out: Path, pr
         scores = score(opened, views, progress)
         write_table(out / TABLE, scores)
         write_pictures(out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
-        facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size)
+        facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
     write_json(out / METRICS, facts)
     return {name: facts[name] for name in ("cameras", "held_out", "mean")}
 
@@ -129,7 +133,7 @@ def evaluate_scene(
         width = header.extra["max_width"]
         views = Views(find_capture(capture).videos, frames, [lenses[name] for name in names], max_width=width)
         scores = score(opened, views, progress)
-        return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size)
+        return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
 
 
 def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
@@ -155,17 +159,28 @@ def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
     A camera without a picture at an instant is not scored there.
     """
     artist, scores = Artist(scene), []
+    last: dict[str, np.ndarray] = {}
     for frame in range(len(scene)):
         gaussians = scene.gaussians(frame)
         for index, camera in enumerate(views.cameras):
             pixels, balanced = views.pixels(index, frame), views.picture(index, frame)
             if pixels is not None and balanced is not None:
                 truth = np.ascontiguousarray(pixels.transpose(2, 0, 1), dtype=np.float32) / 255
-                values = _compare(artist.draw(gaussians, camera), truth, balanced)
+                drawn = artist.draw(gaussians, camera)
+                error, before = drawn - balanced, last.get(camera.name)
+                flicker = None if before is None else float(np.abs(error - before).mean())
+                last[camera.name] = error
                 held_out = camera.name in scene.header.held_out
-                scores.append(Score(frame, int(scene.header.times_ns[frame]), camera.name, held_out, *values))
+                time_ns = int(scene.header.times_ns[frame])
+                values = _compare(drawn, truth, balanced)
+                scores.append(Score(frame, time_ns, camera.name, held_out, *values, flicker=flicker))
         progress(frame + 1, len(scene), f"{_mean([s.psnr_rig_db for s in scores]) or 0:.2f} dB")
     return scores
+
+
+def segment_starts(scene: Scene) -> list[int]:
+    """First frames of the segments after the first one."""
+    return [entry.first for entry in scene.index.segments[1:]]
 
 
 def write_pictures(folder: Path, scene: Scene, views: Views, chosen: Sequence[tuple[str, int, str]]) -> None:
@@ -254,8 +269,11 @@ def read_table(path: Path) -> tuple[Score, ...]:
         return tuple(Score(**row) for row in pa.ipc.open_file(source).read_all().to_pylist())
 
 
-def summary(scores: Sequence[Score], *, frames: int, size_bytes: int) -> dict[str, Any]:
-    """Means over the frames, per camera and over all, and the size of the scene file."""
+def summary(scores: Sequence[Score], *, frames: int, size_bytes: int, borders: Sequence[int]) -> dict[str, Any]:
+    """Means over the frames, per camera and over all, the size of the scene file, and how much segment borders show.
+
+    `borders` are the first frames of segments. `seam` is their flicker over that of all other frames; 1 is seamless.
+    """
     names = list(dict.fromkeys(item.camera for item in scores))
     return {
         "frames": frames,
@@ -263,9 +281,17 @@ def summary(scores: Sequence[Score], *, frames: int, size_bytes: int) -> dict[st
         "held_out": all(item.held_out for item in scores),
         "mean": _means(scores),
         "by_camera": {name: _means([item for item in scores if item.camera == name]) for name in names},
+        "seam": _seam(scores, set(borders)),
         "bytes": size_bytes,
         "bytes_per_frame": size_bytes / frames,
     }
+
+
+def _seam(scores: Sequence[Score], borders: set[int]) -> float | None:
+    """None for a scene of one segment, or one in which nothing flickers."""
+    at_border = _mean([item.flicker for item in scores if item.frame in borders])
+    inside = _mean([item.flicker for item in scores if item.frame not in borders])
+    return at_border / inside if at_border is not None and inside else None
 
 
 def _means(scores: Sequence[Score]) -> dict[str, float | None]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +17,7 @@ from packuv.files import write_json
 from packuv.fit import KeyState
 from packuv.frames import Views
 from packuv.motion import MotionCache, MotionOptions, changed_between
+from packuv.segment import Segment
 from packuv.solver import FitOptions
 from packuv.start import Points
 from packuv.stream import hold_absent
@@ -29,7 +32,7 @@ from tasks.track import MOTION
 from tasks.workshop import Workshop
 
 VERSION = 1
-SEGMENT = "segment.npz"
+SEGMENT, FIGURES = "segment.npz", "fit.json"
 SURE_VIEWS = 3
 """Cameras that must see a point for Gaussians to start there; two may agree by chance"""
 
@@ -123,6 +126,19 @@ def fit_segment(
     return workshop.make("segment", VERSION, reads, inputs, "tasks.splat:build_segment", arguments, label=label)
 
 
+def read_losses(workshop: Workshop, segment: Key) -> list[float]:
+    """Loss of each frame after a segment's keyframe, NaN where nothing moved."""
+    frames = json.loads((workshop.path(segment) / FIGURES).read_text())["frames"]
+    return [frame.get("loss", math.nan) for frame in frames]
+
+
+def cut_segment(workshop: Workshop, segment: Key, frames: int) -> Key:
+    """The first frames of a segment, as a segment."""
+    arguments = {"segment": workshop.path(segment), "frames": frames}
+    inputs = {"segment": segment}
+    return workshop.make("segment", VERSION, {"frames": frames}, inputs, "tasks.splat:build_cut", arguments)
+
+
 def build_first(
     footage: Footage,
     points: Path,
@@ -181,8 +197,18 @@ def build_segment(
         progress=_counted(progress),
     )
     hold_absent(segment).save(out / SEGMENT)
-    write_json(out / "fit.json", {"frames": figures})
+    write_json(out / FIGURES, {"frames": figures})
     return {"frames": len(segment), "gaussians": len(segment.key), "dynamic": int(segment.dynamic.sum())}
+
+
+def build_cut(segment: Path, frames: int, out: Path) -> dict[str, Any]:
+    """The job behind `cut_segment`."""
+    whole = Segment.load(segment / SEGMENT)
+    part = replace(whole, xyz=whole.xyz[: frames - 1], attributes=whole.attributes[: frames - 1])
+    part.save(out / SEGMENT)
+    figures = json.loads((segment / FIGURES).read_text())["frames"][: frames - 1]
+    write_json(out / FIGURES, {"frames": figures})
+    return {"frames": frames, "gaussians": len(part.key), "dynamic": int(part.dynamic.sum())}
 
 
 def _sure_points(sparse: SparsePoints) -> Points:

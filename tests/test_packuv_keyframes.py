@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,6 +18,7 @@ from packuv.keyframes import (
     choose_keyframes,
     fitting_order,
     motion_curve,
+    promoted,
     running_mean,
     segments,
 )
@@ -145,3 +149,20 @@ def test_the_chain_starts_where_most_cameras_filmed_and_reaches_every_keyframe_o
         assert abs(index - start) == 1
         known.add(index)
     assert known == set(range(5))
+
+
+def test_a_frame_far_above_its_segments_first_ones_is_promoted():
+    options = KeyframeOptions(separation=8, max_segment=20, promotion=1.5)
+    calm = [1.0, 1.1, 0.9, 1.0, 1.2, 1.0, 1.1, 1.0, 1.0, 1.0]
+    assert promoted(calm, options) is None
+    assert promoted([*calm[:6], 1.6, 2.0, *calm[8:]], options) == 7  # frame 0 is the keyframe
+    assert promoted([*calm[:6], 1.6, 2.0, *calm[8:]], replace(options, promotion=0)) is None
+    assert promoted([9.0, *calm[1:]], options) is None  # too near to the keyframe
+    assert promoted([*calm[:-1], 9.0], options) is None  # too near to the end
+    assert promoted([], options) is None
+
+
+@given(st.lists(st.one_of(st.just(math.nan), st.floats(0, 10)), max_size=60), st.integers(2, 20))
+def test_a_promoted_frame_leaves_two_long_parts(losses, separation):
+    frame = promoted(losses, KeyframeOptions(separation=separation, max_segment=40))
+    assert frame is None or separation // 2 <= frame <= len(losses) + 1 - separation // 2

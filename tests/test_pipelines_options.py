@@ -6,6 +6,8 @@ import re
 
 import pytest
 
+from packuv.encoder import TOLERANCES, Quality
+from packuv.stream import Tolerance
 from pipelines.options import SequenceOptions, compose
 from pipelines.request import PRESETS, RunRequest
 from sync.capture import CaptureSettings
@@ -56,3 +58,12 @@ def test_wrong_settings_are_named_by_their_path(settings, message):
 def test_a_request_refuses_what_does_not_exist():
     with pytest.raises(ValueError, match="preset must be one of draft, standard, high, but is 'best'"):
         RunRequest("capture", "out", preset="best")
+
+
+def test_quality_sets_the_tolerance_of_the_scene_file_and_settings_win_over_it():
+    assert compose("draft", CAPTURE, {}).encode.tolerance.exact
+    assert compose("draft", CAPTURE, {}, quality="high").encode.tolerance == TOLERANCES[Quality.HIGH]
+    set_by_hand = {"encode": {"tolerance": {"position": 3}}}
+    assert compose("draft", CAPTURE, set_by_hand, quality="low").encode.tolerance == Tolerance(3, 4)
+    with pytest.raises(ValueError, match="quality must be one of lossless, high, medium, low, but is 'ultra'"):
+        RunRequest("capture", "out", quality="ultra")

@@ -38,9 +38,12 @@ def test_own_gain_does_not_explain_structure():
     assert psnr(with_own_gain(noisy, SCENE), SCENE) == pytest.approx(psnr(noisy, SCENE), abs=0.5)
 
 
+FLICKER = (None, 0.01, 0.03)
+
+
 def scores() -> list[Score]:
     return [
-        Score(frame, frame * 33_000_000, camera, True, 20.0 + frame, 0.5, level, 0.6, 22.0, 0.7)
+        Score(frame, frame * 33_000_000, camera, True, 20.0 + frame, 0.5, level, 0.6, 22.0, 0.7, FLICKER[frame])
         for frame in range(3)
         for camera, level in (("cam05", 24.0), ("cam14", None))
     ]
@@ -53,12 +56,14 @@ def test_table_gives_scores_back(tmp_path):
 
 def test_exact_pictures_count_as_infinite_in_the_report_and_not_at_all_in_means():
     assert [item.psnr_db for item in frame_scores(scores())][:2] == [24.0, float("inf")]
-    facts = summary(scores(), frames=3, size_bytes=3000)
+    facts = summary(scores(), frames=3, size_bytes=3000, borders=[2])
     assert facts["by_camera"]["cam05"]["psnr_rig_db"] == 24.0
     assert facts["by_camera"]["cam14"]["psnr_rig_db"] is None
     assert facts["mean"]["psnr_db"] == 21.0
     assert facts["held_out"]
     assert facts["bytes_per_frame"] == 1000
+    assert facts["seam"] == pytest.approx(3.0)
+    assert summary(scores(), frames=3, size_bytes=3000, borders=[])["seam"] is None
 
 
 @given(st.lists(st.text(min_size=1, max_size=3), unique=True, max_size=40), st.integers(1, 8))
