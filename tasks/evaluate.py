@@ -172,8 +172,8 @@ def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
                 last[camera.name] = error
                 held_out = camera.name in scene.header.held_out
                 time_ns = int(scene.header.times_ns[frame])
-                values = _compare(drawn, truth, balanced)
-                scores.append(Score(frame, time_ns, camera.name, held_out, *values, flicker=flicker))
+                values = [*_compare(drawn, truth, balanced), flicker]
+                scores.append(Score(frame, time_ns, camera.name, held_out, *values))
         progress(frame + 1, len(scene), f"{_mean([s.psnr_rig_db for s in scores]) or 0:.2f} dB")
     return scores
 
