@@ -24,9 +24,11 @@ from packuv.files import write_json, write_npz
 from packuv.frames import Views
 from packuv.labels import active_tiles, dynamic_labels
 from packuv.lift import lift_motion
+from packuv.losses import photometric_loss
 from packuv.model import ATTRIBUTES, Model, canonical, rows_of
 from packuv.motion import MotionCache, MotionOptions, difference
 from packuv.quantize import OPACITY, OPACITY_RANGE, Codes, Gaussians, Quantizer, attribute_values
+from packuv.raster import RasterOptions, Workspace, render
 from packuv.segment import Segment
 from packuv.shell import sweep_shell
 from packuv.solver import FitOptions, Progress, Shot, Solver, Ticks, halved
@@ -111,13 +113,15 @@ def fit_first(
     if first is still_shots:
         solver.run(first, round(total * options.background.iteration_share) - coarse, of=total, dense=True, ticks=ticks)
         masks = _before_background(views, instant, stills, motion)
-        born = _hull_gaussians(views, instant, masks, bounds, options, rng)
+        born = _hull_gaussians(views, instant, masks, bounds, options, rng, options.sh_degree)
         solver.append(rows_of(born, slice(0, max(0, options.density.cap - len(model)))))
     solver.run(shots, floating - solver.done, of=total, dense=True, ticks=ticks)
     solver.keep(solver.worth_keeping())
     model.gaussians = canonical(model.gaussians)
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
-    solver.fix(choose_quantizer(model.gaussians, bounds, options.sh_degree))
+    degree = needed_degree(model.gaussians, shots, near=bounds.near, options=options)
+    model.limit_sh(degree)
+    solver.fix(choose_quantizer(model.gaussians, bounds, degree))
     loss = solver.run(shots, total - floating, of=total, ticks=ticks)
     return KeyState(instant, model.gaussians, solver.known_quantizer, bounds, _figures(started, loss, solver))
 
@@ -154,7 +158,7 @@ def fit_next(
     solver.keep(~gone)
     solver.free(_labels(model.gaussians, quantizer, views, masks, bounds, options))
     seen = [mask if alone is None else alone for alone, mask in zip(after, masks, strict=True)]
-    born = _hull_gaussians(views, instant, seen, bounds, options, rng)
+    born = _hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree)
     solver.append(rows_of(born, slice(0, max(0, options.density.cap - len(model)))))
     shots = _tiled(shots, masks, solver, views)
     loss = solver.run(shots, options.key_iterations, of=options.key_iterations, dense=True,
@@ -263,6 +267,24 @@ def _surface(shots: Sequence[Shot], points: Points | None, bounds: Bounds, optio
     return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
 
 
+def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, options: FitOptions) -> int:
+    """The lowest SH degree whose pictures are nearly as good as those of all bands: view dependence that a scene does
+    not show is not carried. Nothing is fitted again, so a band that helps is kept rather than lost."""
+    full, workspace = options.sh_degree, Workspace()
+
+    def loss(degree: int) -> float:
+        cut = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
+        drawn = (render(cut, s.camera, options=RasterOptions(near), workspace=workspace).colour for s in shots)
+        values = [photometric_loss(picture, shot.target, options=options.photometric).value
+                  for picture, shot in zip(drawn, shots, strict=True)]  # fmt: skip
+        return float(np.mean(values))
+
+    if not full:
+        return 0
+    enough = loss(full) * (1 + options.sh_gain)
+    return next(degree for degree in range(full + 1) if degree == full or loss(degree) <= enough)
+
+
 def choose_quantizer(gaussians: Gaussians, bounds: Bounds, sh_degree: int) -> Quantizer:
     """Ranges from the first keyframe with room for what later frames bring; frozen for the sequence."""
     values = attribute_values(gaussians)  # [N, A]
@@ -329,6 +351,7 @@ def _hull_gaussians(
     bounds: Bounds,
     options: FitOptions,
     rng: np.random.Generator,
+    sh_degree: int,
 ) -> Gaussians:
     """New Gaussians inside the hull of the masks: what moved there since the last keyframe has none yet."""
     found = [(camera, views.picture(i, instant), masks[i]) for i, camera in enumerate(views.cameras)]
@@ -337,7 +360,7 @@ def _hull_gaussians(
                          options=options.start, count=options.key_births, rng=rng)  # fmt: skip
     spacing = neighbour_distance(points.xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 0.02 * bounds.radius)
-    born = round_gaussians(points.xyz, points.rgb, scale, opacity=options.start.opacity, sh_degree=options.sh_degree)
+    born = round_gaussians(points.xyz, points.rgb, scale, opacity=options.start.opacity, sh_degree=sh_degree)
     return canonical(born)
 
 

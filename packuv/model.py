@@ -69,6 +69,14 @@ class Model:
         self.gaussians = Gaussians(*merged)
         self.moments = {name: state.grown(len(born)) for name, state in self.moments.items()}
 
+    def limit_sh(self, degree: int) -> None:
+        """Forget the spherical harmonics above a degree."""
+        count = (degree + 1) ** 2
+        self.gaussians = replace(self.gaussians, sh=np.ascontiguousarray(self.gaussians.sh[:, :count]))
+        state = self.moments["sh"]
+        first, second = (np.ascontiguousarray(moment[:, : 3 * count]) for moment in (state.first, state.second))
+        self.moments["sh"] = AdamState(first, second, state.steps)
+
     def overwrite(self, rows: np.ndarray, values: Gaussians) -> None:
         """Give the rows, indices [n], new lives: values of n Gaussians and fresh moments."""
         for name in ATTRIBUTES:

@@ -51,7 +51,9 @@ class FitOptions:
     float_share: float = 0.7
     """Share of the first keyframe's iterations before the quantizer is fixed"""
     sh_degree: int = 0
-    """View dependence: 0 none, 1 to 3 as in 3D Gaussian Splatting"""
+    """View dependence at most: 0 none, 1 to 3 as in 3D Gaussian Splatting; bands that gain nothing are dropped"""
+    sh_gain: float = 0.01
+    """Share of the loss that the bands above a degree must gain to be carried"""
     near_share: float = 0.2
     """Near plane, in scene radii; cameras may sit in the wall they film"""
     near_jitter: float = 0.5

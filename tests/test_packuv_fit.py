@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from packuv.density import DensityOptions
-from packuv.fit import KeyState, fit_first, fit_next, fit_segment
+from packuv.fit import KeyState, fit_first, fit_next, fit_segment, needed_degree
 from packuv.frames import LensCamera, Views
 from packuv.metrics import psnr
 from packuv.model import ATTRIBUTES
 from packuv.motion import MotionCache, MotionOptions, changed_between, measure_motion
 from packuv.raster import RasterOptions, render
-from packuv.solver import FitOptions
+from packuv.solver import FitOptions, Shot
 from packuv.start import StartOptions, round_gaussians
 
 FRAMES = 4
@@ -154,7 +154,7 @@ def test_without_motion_nothing_is_fitted(views, key, motion, tmp_path):
 
 def test_the_next_keyframe_keeps_every_code_of_what_did_not_change(views, key):
     masks = [changed_between(views, camera, 0, 3, MOTION) for camera in range(len(views.cameras))]
-    later = fit_next(key, views, 3, masks=masks, options=OPTIONS)
+    later = fit_next(key, views, 3, masks=masks, motion=MOTION, options=OPTIONS)
     before, after = key.quantizer.encode(key.gaussians), later.quantizer.encode(later.gaussians)
     kept = {row.tobytes() for row in np.hstack([before.xyz.view(np.uint8), before.attributes])}
     shared = sum(row.tobytes() in kept for row in np.hstack([after.xyz.view(np.uint8), after.attributes]))
@@ -165,9 +165,29 @@ def test_the_next_keyframe_keeps_every_code_of_what_did_not_change(views, key):
 
 def test_no_change_gives_the_same_keyframe(views, key):
     masks = [np.zeros((c.height, c.width), bool) for c in views.cameras]
-    assert same(fit_next(key, views, 1, masks=masks, options=OPTIONS).gaussians, key.gaussians)
+    assert same(fit_next(key, views, 1, masks=masks, motion=MOTION, options=OPTIONS).gaussians, key.gaussians)
 
 
 def _made(folder):
     folder.mkdir()
     return folder
+
+
+def test_view_dependence_that_a_scene_lacks_is_not_carried(views):
+    fitted = fit_first(
+        views, 0, points=None, motion=MOTION, options=dataclasses.replace(OPTIONS, sh_degree=2, iterations=60)
+    )
+    # The truth has none; with bands up to degree 2 a fit finds next to nothing for them.
+    assert fitted.quantizer.sh_degree < 2
+    assert fitted.gaussians.sh.shape[1] == (fitted.quantizer.sh_degree + 1) ** 2
+
+
+def test_view_dependence_that_a_scene_shows_is_kept(views):
+    options = FitOptions(sh_degree=1)
+    base = truth(0)
+    shiny = dataclasses.replace(base, sh=np.concatenate([base.sh, np.full((len(base), 3, 3), 0.3, np.float32)], axis=1))
+    shots = [Shot(c, render(shiny, c, options=RasterOptions(0.1)).colour) for c in views.cameras]
+    assert needed_degree(shiny, shots, near=0.1, options=options) == 1
+    plain = [Shot(c, render(base, c, options=RasterOptions(0.1)).colour) for c in views.cameras]
+    dull = dataclasses.replace(shiny, sh=np.concatenate([base.sh, np.zeros((len(base), 3, 3), np.float32)], axis=1))
+    assert needed_degree(dull, plain, near=0.1, options=options) == 0
