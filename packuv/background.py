@@ -6,10 +6,13 @@ it first paints no head onto the wall behind it, and has the wall that a step as
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from packuv.files import write_npz
 from packuv.frames import Views
 
 
@@ -44,7 +47,9 @@ class Still:
     """bool [H, W]: most instants agree on it"""
 
 
-def find_background(views: Views, options: BackgroundOptions) -> list[Still]:
+def find_background(
+    views: Views, options: BackgroundOptions, progress: Callable[[int, int], None] | None = None
+) -> list[Still]:
     """Backgrounds of the cameras that filmed at least three of the chosen instants."""
     instants = np.unique(np.linspace(0, len(views) - 1, min(options.instants, len(views))).round().astype(int))
     stills = []
@@ -53,7 +58,21 @@ def find_background(views: Views, options: BackgroundOptions) -> list[Still]:
         found = [picture for picture in pictures if picture is not None]
         if len(found) >= 3:
             stills.append(_still(camera, np.stack(found), options))
+        if progress:
+            progress(camera + 1, len(views.cameras))
     return stills
+
+
+def save_stills(path: Path, stills: Sequence[Still]) -> None:
+    """Write one .npz with all backgrounds."""
+    arrays = {f"{name}_{still.camera}": getattr(still, name) for still in stills for name in ("pixels", "known")}
+    write_npz(path, {"cameras": np.array([still.camera for still in stills], np.int64), **arrays})
+
+
+def load_stills(path: Path) -> list[Still]:
+    """What `save_stills` wrote."""
+    with np.load(path) as data:
+        return [Still(int(c), data[f"pixels_{c}"], data[f"known_{c}"]) for c in data["cameras"]]
 
 
 def _still(camera: int, pictures: np.ndarray, options: BackgroundOptions) -> Still:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.background import Still, find_background
+from packuv.background import Still
 from packuv.density import opacity
 from packuv.files import write_json, write_npz
 from packuv.frames import Views
@@ -85,6 +85,7 @@ def fit_first(
     instant: int,
     *,
     points: Points | None,
+    stills: Sequence[Still],
     motion: MotionOptions,
     options: FitOptions,
     progress: Progress | None = None,
@@ -92,11 +93,11 @@ def fit_first(
     """Fit the first keyframe from sparse points, the shell around the scene and random Gaussians: the background of
     the sequence first, then what stands before it.
 
-    `views` must hold the cameras to fit and no others. Raises ValueError if fewer than two have a picture.
+    `views` must hold the cameras to fit and no others; `stills` are their backgrounds, or empty. Raises ValueError if
+    fewer than two have a picture.
     """
     started = time.monotonic()
     shots = _shots(views, instant)
-    stills = find_background(views, options.background) if options.background.iteration_share else []
     still_shots = [Shot(views.cameras[s.camera], views.balanced(s.camera, s.pixels), known=s.known) for s in stills]
     first = still_shots if len(still_shots) >= len(shots) else shots
     bounds = find_bounds(views.cameras, near_share=options.near_share)
@@ -132,6 +133,7 @@ def fit_next(
     instant: int,
     *,
     masks: Sequence[np.ndarray | None],
+    stills: Sequence[Still],
     motion: MotionOptions,
     options: FitOptions,
     progress: Progress | None = None,
@@ -140,7 +142,8 @@ def fit_next(
 
     `masks` tell, per camera of `views`, what differs between the two instants, bool [H, W] (None: unknown, the whole
     picture may). Gaussians that touch no mask keep every code. What stood before the background
-    and has gone is dropped, and new Gaussians are born in the hull of what stands there now.
+    and has gone is dropped, and new Gaussians are born in the hull of what stands
+    there now; `stills` may be empty, then nothing is known to have gone.
     """
     started = time.monotonic()
     bounds, quantizer = previous.bounds, previous.quantizer
@@ -151,7 +154,6 @@ def fit_next(
     if not any(mask is None or mask.any() for mask in masks):
         return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, 0.0, solver))
     shots = _shots(views, instant, masks)
-    stills = find_background(views, options.background) if options.background.iteration_share else []
     before, after = (_before_background(views, i, stills, motion) for i in (previous.instant, instant))
     gone = _inside(model.gaussians, views, before, bounds, options)
     gone &= ~_inside(model.gaussians, views, after, bounds, options)

@@ -34,6 +34,7 @@ class Chain:
     submit: Submit
     groups: Key
     points: Key
+    background: Key | None
     motion: Key
 
     def fit(self, spans: Sequence[range]) -> list[tuple[Key, Key]]:
@@ -64,11 +65,11 @@ class Chain:
         return [(key, head), *self._promote(after, self._segment(after, rest).result(), rest)]
 
     def _first(self, instant: int) -> Future:
-        sources, options = (self.workshop, self.plan, self.groups, self.points), self.options
+        sources, options = (self.workshop, self.plan, self.groups, self.points, self.background), self.options
         return self.submit(fit_first, *sources, instant, options.pictures, options.motion, options.fit)
 
     def _next(self, key: Key, step: tuple[int, int]) -> Future:
-        sources, options = (self.workshop, self.plan, self.groups, self.points), self.options
+        sources, options = (self.workshop, self.plan, self.groups, self.points, self.background), self.options
         return self.submit(fit_next, *sources, key, step, options.pictures, options.motion, options.fit)
 
     def _segment(self, key: Key, span: range) -> Future:

@@ -17,6 +17,7 @@ from tasks.calibrate import find_points, find_rig
 from tasks.encode import encode, verify
 from tasks.evaluate import evaluate
 from tasks.plan import Plan
+from tasks.splat import find_background
 from tasks.store import Key
 from tasks.synchronize import synchronize
 from tasks.track import choose_keyframes, find_motion, read_spans
@@ -86,7 +87,11 @@ def _track(workshop: Workshop, plan: Plan, options: SequenceOptions, submit: Sub
 
 
 def _fit(workshop: Workshop, plan: Plan, options: SequenceOptions, submit: Submit, made: Made) -> None:
-    sources = (made.only("sync"), made.only("points"), made.only("motion"))
+    groups, points, motion = (made.only(stage) for stage in ("sync", "points", "motion"))
+    settings = (options.pictures, options.fit.background)
+    background = submit(find_background, workshop, plan, groups, points, *settings).result()
+    if background:
+        made.add(background)
     spans = read_spans(workshop, made.only("keyframes"))
-    for pair in Chain(workshop, plan, options, submit, *sources).fit(spans):
+    for pair in Chain(workshop, plan, options, submit, groups, points, background, motion).fit(spans):
         made.add(*pair)

@@ -13,6 +13,8 @@ import numpy as np
 
 from calibration.triangulate import SparsePoints
 from packuv import fit
+from packuv.background import BackgroundOptions, Still, load_stills, save_stills
+from packuv.background import find_background as measure_background
 from packuv.files import write_json
 from packuv.fit import KeyState
 from packuv.frames import Views
@@ -32,7 +34,7 @@ from tasks.track import MOTION
 from tasks.workshop import Workshop
 
 VERSION = 1
-SEGMENT, FIGURES = "segment.npz", "fit.json"
+SEGMENT, FIGURES, STILLS = "segment.npz", "fit.json", "stills.npz"
 SURE_VIEWS = 3
 """Cameras that must see a point for Gaussians to start there; two may agree by chance"""
 
@@ -45,11 +47,35 @@ def count_pictures(workshop: Workshop, plan: Plan, groups: Key, instants: Sequen
     return [int((found.frames[first + instant, columns] >= 0).sum()) for instant in instants]
 
 
+def find_background(
+    workshop: Workshop, plan: Plan, groups: Key, points: Key, pictures: PictureOptions, options: BackgroundOptions
+) -> Key | None:
+    """Find what stands still in each fitted camera: stills.npz. None where the options ask for no background."""
+    if not options.iteration_share:
+        workshop.listener.skipped("background", "fit.background.iteration_share is 0")
+        return None
+    options = replace(options, iteration_share=BackgroundOptions().iteration_share)  # how it is used changes nothing
+    arguments = {
+        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
+        "options": options,
+    }
+    reads = {
+        "background": options,
+        "pictures": pictures,
+        "cameras": plan.fitted,
+        "first": plan.first,
+        "stop": plan.stop,
+    }
+    inputs = {"groups": groups, "points": points}
+    return workshop.make("background", VERSION, reads, inputs, "tasks.splat:build_background", arguments)
+
+
 def fit_first(
     workshop: Workshop,
     plan: Plan,
     groups: Key,
     points: Key,
+    background: Key | None,
     instant: int,
     pictures: PictureOptions,
     motion: MotionOptions,
@@ -60,13 +86,13 @@ def fit_first(
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "points": workshop.path(points) / POINTS,
+        "background": _stills_path(workshop, background),
         "instant": instant,
         "motion": motion,
         "options": options,
     }
-    # The background is the median of the whole range, so its end counts here.
-    reads = {**_reads(plan, pictures, options), "instant": instant, "stop": plan.stop, "motion": motion}
-    inputs = {"groups": groups, "points": points}
+    reads = {**_reads(plan, pictures, options), "instant": instant, "motion": motion}
+    inputs = {"groups": groups, "points": points, **({"background": background} if background else {})}
     return workshop.make(
         "key", VERSION, reads, inputs, "tasks.splat:build_first", arguments, label=f"fit key {instant}"
     )
@@ -77,6 +103,7 @@ def fit_next(
     plan: Plan,
     groups: Key,
     points: Key,
+    background: Key | None,
     previous: Key,
     step: tuple[int, int],
     pictures: PictureOptions,
@@ -84,16 +111,20 @@ def fit_next(
     options: FitOptions,
 ) -> Key:
     """Fit the keyframe at instant `step[1]` from the one at `step[0]`."""
-    options = _without(options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell")
+    options = _without(
+        options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell", "background"
+    )
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "previous": workshop.path(previous),
+        "background": _stills_path(workshop, background),
         "instant": step[1],
         "motion": motion,
         "options": options,
     }
-    reads = {**_reads(plan, pictures, options), "motion": motion, "step": step, "stop": plan.stop}
+    reads = {**_reads(plan, pictures, options), "motion": motion, "step": step}
     inputs = {"groups": groups, "points": points, "previous": previous}
+    inputs |= {"background": background} if background else {}
     label = f"fit key {step[1]}"
     return workshop.make("key", VERSION, reads, inputs, "tasks.splat:build_next", arguments, label=label)
 
@@ -139,9 +170,17 @@ def cut_segment(workshop: Workshop, segment: Key, frames: int) -> Key:
     return workshop.make("segment", VERSION, {"frames": frames}, inputs, "tasks.splat:build_cut", arguments)
 
 
+def build_background(footage: Footage, options: BackgroundOptions, out: Path, progress: Progress) -> dict[str, Any]:
+    """The job behind `find_background`."""
+    stills = measure_background(footage.open_views(), options, _counted(progress))
+    save_stills(out / STILLS, stills)
+    return {"cameras": len(stills), "known_share": float(np.mean([still.known.mean() for still in stills] or [0]))}
+
+
 def build_first(
     footage: Footage,
     points: Path,
+    background: Path | None,
     instant: int,
     motion: MotionOptions,
     options: FitOptions,
@@ -151,7 +190,13 @@ def build_first(
     """The job behind `fit_first`."""
     known = _sure_points(SparsePoints.load(points)) if points.exists() else None
     state = fit.fit_first(
-        footage.open_views(), instant, points=known, motion=motion, options=options, progress=_counted(progress)
+        footage.open_views(),
+        instant,
+        points=known,
+        stills=_stills(background),
+        motion=motion,
+        options=options,
+        progress=_counted(progress),
     )
     state.save(out)
     return dict(state.figures)
@@ -160,6 +205,7 @@ def build_first(
 def build_next(
     footage: Footage,
     previous: Path,
+    background: Path | None,
     instant: int,
     motion: MotionOptions,
     options: FitOptions,
@@ -170,7 +216,14 @@ def build_next(
     views, before = footage.open_views(), KeyState.load(previous)
     masks = _changes(views, before.instant, instant, motion)
     state = fit.fit_next(
-        before, views, instant, masks=masks, motion=motion, options=options, progress=_counted(progress)
+        before,
+        views,
+        instant,
+        masks=masks,
+        stills=_stills(background),
+        motion=motion,
+        options=options,
+        progress=_counted(progress),
     )
     state.save(out)
     return dict(state.figures)
@@ -209,6 +262,14 @@ def build_cut(segment: Path, frames: int, out: Path) -> dict[str, Any]:
     figures = json.loads((segment / FIGURES).read_text())["frames"][: frames - 1]
     write_json(out / FIGURES, {"frames": figures})
     return {"frames": frames, "gaussians": len(part.key), "dynamic": int(part.dynamic.sum())}
+
+
+def _stills_path(workshop: Workshop, background: Key | None) -> Path | None:
+    return workshop.path(background) / STILLS if background else None
+
+
+def _stills(path: Path | None) -> list[Still]:
+    return load_stills(path) if path else []
 
 
 def _sure_points(sparse: SparsePoints) -> Points:

@@ -2,7 +2,7 @@ import av
 import numpy as np
 import pytest
 
-from packuv.background import BackgroundOptions, find_background
+from packuv.background import BackgroundOptions, find_background, load_stills, save_stills
 from packuv.frames import LensCamera, Views
 
 FRAMES, HEIGHT, WIDTH = 9, 48, 64
@@ -56,3 +56,12 @@ def test_cameras_that_filmed_too_little_have_no_background(views):
 def test_options_refuse_shares_that_leave_nothing():
     with pytest.raises(ValueError, match="iteration_share"):
         BackgroundOptions(iteration_share=1.0)
+
+
+def test_saved_backgrounds_come_back(views, tmp_path):
+    stills = find_background(views, BackgroundOptions(instants=FRAMES))
+    save_stills(tmp_path / "stills.npz", stills)
+    for still, again in zip(stills, load_stills(tmp_path / "stills.npz"), strict=True):
+        assert again.camera == still.camera
+        np.testing.assert_array_equal(again.pixels, still.pixels)
+        np.testing.assert_array_equal(again.known, still.known)

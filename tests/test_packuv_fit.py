@@ -6,6 +6,7 @@ import av
 import numpy as np
 import pytest
 
+from packuv.background import find_background
 from packuv.density import DensityOptions
 from packuv.fit import KeyState, fit_first, fit_next, fit_segment, needed_degree
 from packuv.frames import LensCamera, Views
@@ -52,8 +53,13 @@ def views(ring, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def key(views) -> KeyState:
-    return fit_first(views, 0, points=None, motion=MOTION, options=OPTIONS)
+def stills(views):
+    return find_background(views, OPTIONS.background)
+
+
+@pytest.fixture(scope="module")
+def key(views, stills) -> KeyState:
+    return fit_first(views, 0, points=None, stills=stills, motion=MOTION, options=OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -90,9 +96,11 @@ def test_the_first_keyframe_explains_its_pictures_through_its_codes(views, key):
     assert len(key.gaussians) <= OPTIONS.density.cap
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(views, key):
-    assert same(fit_first(views, 0, points=None, motion=MOTION, options=OPTIONS).gaussians, key.gaussians)
-    other = fit_first(views, 0, points=None, motion=MOTION, options=dataclasses.replace(OPTIONS, seed=1))
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(views, stills, key):
+    assert same(
+        fit_first(views, 0, points=None, stills=stills, motion=MOTION, options=OPTIONS).gaussians, key.gaussians
+    )
+    other = fit_first(views, 0, points=None, stills=stills, motion=MOTION, options=dataclasses.replace(OPTIONS, seed=1))
     assert other.gaussians.means.shape != key.gaussians.means.shape or not same(other.gaussians, key.gaussians)
 
 
@@ -152,9 +160,9 @@ def test_without_motion_nothing_is_fitted(views, key, motion, tmp_path):
     assert [f["iterations"] for f in figures] == [0] * (FRAMES - 1)
 
 
-def test_the_next_keyframe_keeps_every_code_of_what_did_not_change(views, key):
+def test_the_next_keyframe_keeps_every_code_of_what_did_not_change(views, stills, key):
     masks = [changed_between(views, camera, 0, 3, MOTION) for camera in range(len(views.cameras))]
-    later = fit_next(key, views, 3, masks=masks, motion=MOTION, options=OPTIONS)
+    later = fit_next(key, views, 3, masks=masks, stills=stills, motion=MOTION, options=OPTIONS)
     before, after = key.quantizer.encode(key.gaussians), later.quantizer.encode(later.gaussians)
     kept = {row.tobytes() for row in np.hstack([before.xyz.view(np.uint8), before.attributes])}
     shared = sum(row.tobytes() in kept for row in np.hstack([after.xyz.view(np.uint8), after.attributes]))
@@ -163,9 +171,11 @@ def test_the_next_keyframe_keeps_every_code_of_what_did_not_change(views, key):
     assert error(views, decoded, 3, later.bounds.near) > error(views, key.quantizer.decode(before), 3, key.bounds.near)
 
 
-def test_no_change_gives_the_same_keyframe(views, key):
+def test_no_change_gives_the_same_keyframe(views, stills, key):
     masks = [np.zeros((c.height, c.width), bool) for c in views.cameras]
-    assert same(fit_next(key, views, 1, masks=masks, motion=MOTION, options=OPTIONS).gaussians, key.gaussians)
+    assert same(
+        fit_next(key, views, 1, masks=masks, stills=stills, motion=MOTION, options=OPTIONS).gaussians, key.gaussians
+    )
 
 
 def _made(folder):
@@ -173,9 +183,14 @@ def _made(folder):
     return folder
 
 
-def test_view_dependence_that_a_scene_lacks_is_not_carried(views):
+def test_view_dependence_that_a_scene_lacks_is_not_carried(views, stills):
     fitted = fit_first(
-        views, 0, points=None, motion=MOTION, options=dataclasses.replace(OPTIONS, sh_degree=2, iterations=60)
+        views,
+        0,
+        points=None,
+        stills=stills,
+        motion=MOTION,
+        options=dataclasses.replace(OPTIONS, sh_degree=2, iterations=60),
     )
     # The truth has none; with bands up to degree 2 a fit finds next to nothing for them.
     assert fitted.quantizer.sh_degree < 2
