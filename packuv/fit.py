@@ -30,7 +30,7 @@ from packuv.motion import MotionCache, MotionOptions, difference
 from packuv.quantize import OPACITY, OPACITY_RANGE, Codes, Gaussians, Quantizer, attribute_values
 from packuv.raster import RasterOptions, Workspace, render
 from packuv.segment import Segment
-from packuv.shell import sweep_shell
+from packuv.shell import Shell, sweep_shell
 from packuv.solver import FitOptions, Progress, Shot, Solver, Ticks, halved
 from packuv.start import (
     Bounds,
@@ -102,15 +102,19 @@ def fit_first(
     first = still_shots if len(still_shots) >= len(shots) else shots
     bounds = find_bounds(views.cameras, near_share=options.near_share)
     rng = np.random.default_rng([options.seed, instant, 0])
-    start = first_gaussians([s.camera for s in first], [s.target for s in first], bounds=bounds,
-                            surface=_surface(first, points, bounds, options), options=options.start,
-                            sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
+    cameras, targets = [shot.camera for shot in first], [shot.target for shot in first]
+    shell = sweep_shell(cameras, targets, bounds=bounds, options=options.shell) if options.shell.enabled else None
+    start = first_gaussians(cameras, targets, bounds=bounds, surface=_surface(shell, points, options),
+                            options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
     model = Model(start)
     solver = Solver(model, bounds, options, rng)
     total = options.iterations
     ticks = Ticks(progress, total)
     coarse, floating = round(total * options.coarse_share), round(total * options.float_share)
     solver.run([halved(shot) for shot in first], coarse, of=total, dense=True, ticks=ticks)
+    if shell is not None:
+        depths = (shell.depths(camera, index, bounds.near) for index, camera in enumerate(cameras))
+        first[:] = [replace(shot, depths=known) for shot, known in zip(first, depths, strict=True)]
     if first is still_shots:
         solver.run(first, round(total * options.background.iteration_share) - coarse, of=total, dense=True, ticks=ticks)
         masks = _before_background(views, instant, stills, motion)
@@ -254,14 +258,11 @@ def _inside(
     return in_hull(gaussians.means.astype(np.float64), cameras, known, bounds=bounds, options=options.start)
 
 
-def _surface(shots: Sequence[Shot], points: Points | None, bounds: Bounds, options: FitOptions) -> Points:
+def _surface(shell: Shell | None, points: Points | None, options: FitOptions) -> Points:
     """Where surfaces are: sparse points, sure places of the shell, and the rest of the shell evenly."""
     start, rng = options.start, np.random.default_rng([options.seed, 3])
     room = round(start.count * start.surface_share)
     parts = [] if points is None else [drawn(points, room, rng)]
-    shell = None
-    if options.shell.enabled:
-        shell = sweep_shell([s.camera for s in shots], [s.target for s in shots], bounds=bounds, options=options.shell)
     if shell is not None:
         parts.append(shell.sure_points(room - sum(len(part.xyz) for part in parts), rng))
         parts.append(shell.cover(round(start.count * start.shell_share)))

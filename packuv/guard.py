@@ -136,7 +136,7 @@ def _inspect(means, log_scales, quaternions, logits, sh, d_means, d_log_scales, 
             if rows[i] == 0:
                 continue
             fault = 0
-            # Widths are literals, so that the loops unroll: a third of the time.
+            # Widths are literals, so that the loops unroll: half the time.
             # From the last to the first, so that the first attribute at fault is named, and a gradient before all.
             if not _within(sh, i, sh.shape[1], limits[4]):
                 fault = 5

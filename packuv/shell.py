@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit, prange
 
 from packuv.camera import PinholeCamera
+from packuv.losses import SparseDepth
 from packuv.raster.cpu import prefer_tbb
 from packuv.start import Bounds, Points, drawn, pixels_of
 
@@ -72,6 +73,14 @@ class Shell:
     """bool [V, U]: several cameras agree on the place; elsewhere it is interpolated"""
     seen: np.ndarray
     """bool [V, U]: before some camera, or next to a direction that is"""
+    seers: np.ndarray
+    """bool [V, U, C]: cameras that agree on a sure place"""
+
+    def depths(self, camera: PinholeCamera, index: int, near: float) -> SparseDepth:
+        """Depths of the sure places that a camera, by its place among those swept, agrees on."""
+        xyz = self.xyz[self.sure & self.seers[:, :, index]]
+        inside, rows, columns = pixels_of(camera, xyz, near)
+        return SparseDepth(rows * camera.width + columns, camera.project(xyz[inside])[1].astype(np.float32))
 
     def sure_points(self, count: int, rng: np.random.Generator) -> Points:
         """At most `count` of the places that cameras agree on, evenly over the sphere."""
@@ -120,7 +129,7 @@ def sweep_shell(
     xyz = bounds.centre + distance[:, :, None] * rays
     rgb, views = _colours(xyz, cameras, pictures, bounds.near, np.where(sure[:, :, None], seers, True))
     filled = np.stack([interpolate(rgb[:, :, k], (views > 0).astype(np.float64)) for k in range(3)], axis=-1)
-    return Shell(xyz, filled, sure, _grown(views > 0, options.columns // 72))
+    return Shell(xyz, filled, sure, _grown(views > 0, options.columns // 72), seers)
 
 
 def _grown(mask: np.ndarray, cells: int) -> np.ndarray:

@@ -11,12 +11,13 @@ import numpy as np
 from packuv.background import BackgroundOptions
 from packuv.camera import PinholeCamera
 from packuv.density import DensityOptions, ScreenGradient, grow, opacity, prune, relocate
+from packuv.guard import Guard
 from packuv.labels import LabelOptions
 from packuv.lift import LiftOptions
-from packuv.losses import PhotometricOptions, photometric_loss
+from packuv.losses import PhotometricOptions, SparseDepth, depth_loss, photometric_loss
 from packuv.model import ATTRIBUTES, Model, Rates, rows_of
 from packuv.quantize import Gaussians, Quantizer
-from packuv.raster import RasterOptions, Workspace, gradients, render
+from packuv.raster import RasterOptions, Rendering, Workspace, gradients, render
 from packuv.shell import ShellOptions
 from packuv.start import Bounds, StartOptions
 from packuv.uvmap import UvOptions
@@ -61,6 +62,8 @@ class FitOptions:
     camera cannot explain its picture then"""
     near_reach: float = 0.7
     """In scene radii"""
+    depth_weight: float = 0.05
+    """Of the mean error of depth, in scene radii, where the background's shell is sure (paper, objective)"""
     opacity_weight: float = 0.0
     """Of mean alpha (1 - alpha), which makes Gaussians decide (paper, objective)"""
     scale_weight: float = 0.0
@@ -106,6 +109,8 @@ class Shot:
     """bool [tiles_y, tiles_x] where the picture counts; None: everywhere"""
     known: np.ndarray | None = None
     """bool [H, W] where the picture counts within these tiles; None: everywhere"""
+    depths: SparseDepth | None = None
+    """Where the surface is known to be"""
 
 
 def halved(shot: Shot) -> Shot:
@@ -134,6 +139,8 @@ class Solver:
         self._rng = rng
         self._order: list[int] = []
         self._workspace = Workspace()
+        self._guard = Guard(model, bounds)
+        self._overflown = 0
         self.done = 0
 
     @property
@@ -142,13 +149,20 @@ class Solver:
             raise RuntimeError("the quantizer is fixed after the first iterations only")
         return self._quantizer
 
+    @property
+    def guarded(self) -> int:
+        """Times that a Gaussian lost a step because its values or gradients were not finite."""
+        return self._guard.count + self._overflown
+
     def fix(self, quantizer: Quantizer) -> None:
         """From now on render what the codes decode to."""
         self._quantizer, self._drawn = quantizer, None
+        self._guard.renew(self.model)
 
     def free(self, rows: np.ndarray) -> None:
         """Only these rows, bool [N], may change."""
         self.rows = rows.copy()
+        self._guard.check(self.model, None, rows, "before the first iteration")
 
     def append(self, born: Gaussians) -> None:
         """Add Gaussians that may change."""
@@ -169,7 +183,6 @@ class Solver:
         self._order = []
         for _ in range(count):
             losses.append(self._iterate(shots, progress=self.done / of))
-            self.done += 1
             if dense and self.done % self._options.density.every == 0 and self.done < of * self._options.density.until:
                 self._round(of)
             if ticks:
@@ -208,13 +221,23 @@ class Solver:
         if not np.isfinite(loss.value):
             raise ValueError(f"the loss of camera {shot.camera.name!r} is {loss.value} in iteration {self.done}: its "
                              "picture or the Gaussians hold values that are not finite")  # fmt: skip
-        found = gradients(rendering, loss.gradient, rows=self.rows)
+        found = gradients(rendering, loss.gradient, *self._depth_gradients(rendering, shot), rows=self.rows)
         self.gradient.add(found.means2d, rendering.visible, shot.camera.width, shot.camera.height)
         moving = self.rows & (rendering.visible > 0)
         values = {name: getattr(found, name) for name in ATTRIBUTES}
         self._regularise(values, moving)
         self.model.step(values, options.rates, radius=self.bounds.radius * scale, progress=progress, rows=moving)
+        self._guard.check(self.model, values, moving, f"camera {shot.camera.name!r}, iteration {self.done}")
+        self._overflown += found.overflow_count
+        self.done += 1
         return loss.value
+
+    def _depth_gradients(self, rendering: Rendering, shot: Shot) -> tuple[np.ndarray | None, np.ndarray | None]:
+        weight = np.float32(self._options.depth_weight)
+        if shot.depths is None or not weight:
+            return None, None
+        _, d_depth, d_alpha = depth_loss(rendering.depth, rendering.alpha, shot.depths, scale=self.bounds.radius)
+        return weight * d_depth, weight * d_alpha
 
     def _decoded(self) -> Gaussians:
         """What the renderer draws; only rows that may change are decoded again."""
@@ -271,3 +294,4 @@ class Solver:
     def _start_afresh(self) -> None:
         self.gradient = ScreenGradient(len(self.model))
         self._drawn = None
+        self._guard.renew(self.model)

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from packuv.losses import PhotometricOptions, photometric_loss
+from packuv.losses import PhotometricOptions, SparseDepth, depth_loss, photometric_loss
 
 VALUE_TOLERANCE = 1e-6
 """Float32 sums over 10^5 pixels of values below 1; measured 1e-8."""
@@ -147,3 +147,30 @@ def test_wrong_input_is_refused_with_what_came():
         photometric_loss(picture, target, options=PhotometricOptions(), tiles=np.ones((4, 3), bool))
     with pytest.raises(ValueError, match="must lie in"):
         PhotometricOptions(ssim_share=1.5)
+
+
+def test_depth_gradients_agree_with_differences():
+    rng = np.random.default_rng(4)
+    alpha = rng.uniform(0.6, 1, (5, 6)).astype(np.float32)
+    depth = (alpha * rng.uniform(2, 3, (5, 6))).astype(np.float32)
+    known = SparseDepth(np.array([0, 7, 7, 20]), np.array([2.2, 2.9, 1.0, 2.5], np.float32))
+    _, d_depth, d_alpha = depth_loss(depth, alpha, known, scale=2.0)
+    step = 1e-3
+    for place in ((0, 0), (1, 1), (3, 2), (4, 4)):
+        for picture, slope in ((depth, d_depth), (alpha, d_alpha)):
+            up, down = picture.copy(), picture.copy()
+            up[place] += step
+            down[place] -= step
+            pairs = ((up, alpha), (down, alpha)) if picture is depth else ((depth, up), (depth, down))
+            high, low = (depth_loss(*pair, known, scale=2.0)[0] for pair in pairs)
+            # float32 losses of about 0.3, differences over 2e-3
+            assert slope[place] == pytest.approx((high - low) / (2 * step), abs=2e-3)
+
+
+def test_depth_counts_only_where_something_is_drawn():
+    known = SparseDepth(np.array([1, 2]), np.array([3.0, 3.0], np.float32))
+    alpha = np.array([[1.0, 0.2, 0.4]], np.float32)
+    value, d_depth, d_alpha = depth_loss(alpha * 5, alpha, known, scale=1.0)
+    assert value == 0
+    assert not d_depth.any()
+    assert not d_alpha.any()
