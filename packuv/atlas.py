@@ -14,11 +14,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from packuv.files import whole_file
 from packuv.interchange.conventions import SH_C0
 from packuv.quantize import DC, OPACITY, REST, ROTATION, SCALE, Codes, Quantizer, attribute_count
 from packuv.scene import Scene
 from packuv.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
-from packuv.whole import whole_file
 
 POSITION_HI, POSITION_LO, OPACITIES = "position_hi", "position_lo", "opacity"
 """Triplets that are not three columns of the attributes; the third holds opacity, 255 where dynamic, and 0."""

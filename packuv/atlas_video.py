@@ -32,10 +32,10 @@ from packuv.atlas import (
     seat,
     triplet_names,
 )
+from packuv.files import whole_file
 from packuv.quantize import OPACITY, Codes
 from packuv.scene import Scene, SceneHeader, digest, open_scene
 from packuv.uvmap import UvOptions
-from packuv.whole import whole_file
 
 FORMAT, VERSION, ATTACHMENT = "packuv-atlas", 1, "atlas.json"
 EXACT_ALWAYS = (POSITION_HI, POSITION_LO)

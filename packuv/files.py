@@ -1,30 +1,65 @@
-"""Files that are whole or absent: written beside, synced, renamed."""
+"""Files and folders that are whole or absent: written beside, synced, renamed."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Readable JSON, keys in the given order."""
-    _write(path, lambda file: file.write(json.dumps(data, indent=1).encode()))
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(data, indent=1))
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Arrays by name, not compressed."""
-    _write(path, lambda file: np.savez(file, **dict(arrays)))  # type: ignore[arg-type]
+    with whole_file(path) as partial, partial.open("wb") as file:
+        np.savez(file, **dict(arrays))  # type: ignore[arg-type]
 
 
-def _write(path: Path, fill: Callable[[BinaryIO], Any]) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    with open(partial, "wb") as file:
-        fill(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path`, of the same suffix; its file gets the name `path` when the block ends well.
+
+    The bytes are on the disk before the name is given; an error in the block leaves nothing behind. Raises
+    FileNotFoundError where the folder is missing.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"no folder {path.parent} to write {path.name} in; make it first")
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        with partial.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside `path`, which gets that name when the block ends well; an error leaves nothing behind.
+
+    Raises FileExistsError where `path` is there and not an empty folder, FileNotFoundError where its parent is missing.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"no folder {path.parent} to write {path.name} in; make it first")
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise FileExistsError(f"{path} must be new or an empty folder; choose another, or remove it")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir()
+        yield partial
+        os.replace(partial, path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

@@ -51,6 +51,8 @@ class FitOptions:
     """Share of the first keyframe's iterations on pictures of half the size"""
     float_share: float = 0.7
     """Share of the first keyframe's iterations before the quantizer is fixed"""
+    low_precision: bool = True
+    """Render what the codes decode to; without it everything is fitted in floats and rounded afterwards (ablation)"""
     sh_degree: int = 0
     """View dependence at most: 0 none, 1 to 3 as in 3D Gaussian Splatting; bands that gain nothing are dropped"""
     sh_gain: float = 0.01
@@ -241,7 +243,7 @@ class Solver:
 
     def _decoded(self) -> Gaussians:
         """What the renderer draws; only rows that may change are decoded again."""
-        if self._quantizer is None:
+        if self._quantizer is None or not self._options.low_precision:
             return self.model.gaussians
         if self._drawn is None or self.rows.all():
             self._drawn = self._quantizer.decode(self._quantizer.encode(self.model.gaussians))

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from packuv.files import whole_folder
 from packuv.quantize import Codes, attribute_count
 from packuv.scene import Scene, open_scene
 from packuv.viewer.source import SceneSource, describe, frame_bytes, key_bytes, tables_bytes
@@ -30,7 +31,6 @@ from packuv.web_video import (
     key_planes,
     read_stream,
 )
-from packuv.whole import whole_folder
 
 FORMAT, VERSION, INDEX = "packuv-web", 1, "index.json"
 KEY_FILE, DELTA_FILE = "key.ivf", "delta.ivf"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -37,8 +37,8 @@ class Chain:
     background: Key | None
     motion: Key
 
-    def fit(self, spans: Sequence[range]) -> list[tuple[Key, Key]]:
-        """A keyframe and its segment for each span, and for each piece that a promoted keyframe cuts off.
+    def fit(self, spans: Sequence[range]) -> Iterator[tuple[Key, Key]]:
+        """A keyframe and its segment for each span in order, and for each piece that a promoted keyframe cuts off.
 
         The next keyframe is submitted before the segment, because the chain is the longest way through the work.
         """
@@ -51,8 +51,8 @@ class Chain:
             segments[last] = self._segment(keys[last], spans[last])
             keys[index], last = following.result(), index
         segments[last] = self._segment(keys[last], spans[last])
-        pieces = (self._promote(keys[i], segments[i].result(), span) for i, span in enumerate(spans))
-        return [pair for piece in pieces for pair in piece]
+        for index, span in enumerate(spans):
+            yield from self._promote(keys[index], segments[index].result(), span)
 
     def _promote(self, key: Key, segment: Key, span: range) -> list[tuple[Key, Key]]:
         """The segment, cut where the fit of a frame shows that a keyframe is missing."""

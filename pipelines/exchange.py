@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 def export_frames(arguments: argparse.Namespace) -> int:
     """`packuv export SCENE`: one frame as a file, or several as a folder of files, of another program."""
+    from packuv.files import whole_folder
     from packuv.interchange import write_gaussians
     from packuv.scene import open_scene
-    from packuv.whole import whole_folder
 
     kind = _splat_format(arguments.format, arguments.output)
     with open_scene(arguments.scene) as scene:
@@ -136,8 +136,8 @@ def _decibels(values: list[float | None]) -> str:
 def export_cameras(arguments: argparse.Namespace) -> int:
     """`packuv export cameras`: the scene's cameras for another program."""
     from calibration.exporters import write_colmap, write_poses_bounds, write_transforms
+    from packuv.files import whole_folder
     from packuv.scene import open_scene
-    from packuv.whole import whole_folder
 
     with open_scene(arguments.scene) as scene:
         rig = _rig(scene, str(arguments.scene))

@@ -19,7 +19,7 @@ from pipelines.request import RunRequest
 from pipelines.results import Run, collect, run_json
 from pipelines.stages import Made, run_stages
 from sync.capture import Capture, find_capture
-from tasks.encode import SCENE
+from tasks.encode import SCENE, encode_finished
 from tasks.jobs import Jobs
 from tasks.plan import Plan
 from tasks.report import write_report
@@ -27,7 +27,7 @@ from tasks.report_facts import summary
 from tasks.store import Store, write_json
 from tasks.workshop import Workshop
 
-RUN = "run.json"
+RUN, PARTIAL = "run.json", "scene.partial.mkv"
 CORES_PER_JOB = 4
 """A fit's threads wait for each other often enough that a big machine is better used by several fits side by side"""
 
@@ -100,6 +100,7 @@ def process(request: RunRequest, progress: TerminalProgress, submit: Submit) -> 
         return _publish(run, folder)
     except BaseException:
         jobs.cancel()
+        _leave_finished(run, folder)
         raise
     finally:
         write_json(folder / RUN, run_json(run))
@@ -123,12 +124,21 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
+def _leave_finished(run: Run, folder: Path) -> None:
+    """What is fitted of a run that stops, from the first segment on without a gap, as a scene file that plays."""
+    segments = run.made.keys.get("segment", [])
+    if segments and not run.made.get("encode"):
+        sources = (run.workshop, run.plan, run.made.only("sync"), run.made.only("points"), run.made.keys["key"][0])
+        encode_finished(*sources, segments, run.options.pictures, run.options.encode, path=folder / PARTIAL)
+
+
 def _publish(run: Run, folder: Path) -> Outcome:
     """Put the scene file and the report into the sequence's folder."""
     scene = None
     if key := run.made.get("encode"):
         scene = folder / SCENE
         place(run.workshop.path(key) / SCENE, scene)
+        (folder / PARTIAL).unlink(missing_ok=True)
     run.progress.started("report")
     content = collect(run)
     report = write_report(content, folder)

@@ -11,13 +11,14 @@ import shutil
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from packuv.scene import open_scene
-from pipelines.process import Outcome, process_directly
+from pipelines.process import Outcome, process, process_directly
 from pipelines.progress import TerminalProgress
 from pipelines.request import RunRequest
 from studio.capture import SimulateOptions, TruthKind, simulate
@@ -210,3 +211,33 @@ def _as_words(settings: dict[str, Any], path: str = "") -> list[str]:
         else:
             words += ["--set", f"{path}{name}={value}"]
     return words
+
+
+def test_a_run_that_stops_leaves_the_finished_segments_as_a_scene_that_plays(capture, tmp_path):
+    asked, started = request(capture, tmp_path), []
+    with ThreadPoolExecutor(max_workers=2) as pool:
+
+        def submit(function, *arguments):
+            started.append(function.__name__)
+            if started.count("fit_segment") == 2:
+                raise KeyboardInterrupt
+            return pool.submit(function, *arguments)
+
+        with pytest.raises(KeyboardInterrupt):
+            process(asked, TerminalProgress(io.StringIO()), submit)
+    partial = tmp_path / "tiny" / "scene.partial.mkv"
+    assert not partial.exists()  # the first segment was still under way
+
+    def stop_at_encode(function, *arguments):
+        if function.__name__ == "encode":
+            raise KeyboardInterrupt
+        with ThreadPoolExecutor(max_workers=1) as pool:
+            return pool.submit(function, *arguments)
+
+    with pytest.raises(KeyboardInterrupt):
+        process(asked, TerminalProgress(io.StringIO()), stop_at_encode)
+    with open_scene(partial) as scene:
+        assert len(scene) == FRAMES
+    whole, _ = run(asked)
+    assert sha256(whole.folder / "scene.mkv")
+    assert not partial.exists()

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from packuv.files import whole_file
 from packuv.interchange.conventions import (
     alpha_codes,
     drawn,
@@ -26,7 +27,6 @@ from packuv.interchange.conventions import (
     restore_largest,
 )
 from packuv.quantize import Gaussians
-from packuv.whole import whole_file
 
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from packuv.whole import whole_file, whole_folder
+from packuv.files import whole_file, whole_folder
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
