@@ -30,6 +30,7 @@ SINGLE = {
     "encode": "write the scene file",
 }
 """Commands that run the stages up to the one they name"""
+BENCHMARKS = ("ablation", "codec", "motion", "raster", "stress_fit", "sync_index")
 BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
 
@@ -153,8 +154,14 @@ def parser() -> argparse.ArgumentParser:
     _render(command("render", "pipelines.commands:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands:evaluate", "score a scene against a capture"))
     _view(command("view", "pipelines.commands:view", "show a scene in the web browser"))
+    _bench(command("bench", "pipelines.bench:bench", "run one of the benchmarks"))
     command("doctor", "pipelines.doctor:doctor", "tell what this machine has and lacks")
     return top
+
+
+def _bench(command: argparse.ArgumentParser) -> None:
+    command.add_argument("name", choices=BENCHMARKS, metavar="NAME", help=", ".join(BENCHMARKS))
+    command.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="the benchmark's own arguments, or -h")
 
 
 def _simulate(command: argparse.ArgumentParser) -> None:
