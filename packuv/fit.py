@@ -228,7 +228,7 @@ def _fit_frame(
     changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
     tiles = float(np.mean([shot.tiles.mean() for shot in shots if shot.tiles is not None]))
     figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count, "loss": loss,
-               "dynamic": int(changed.sum()), "tiles": tiles}  # fmt: skip
+               "dynamic": int(changed.sum()), "tiles": tiles, "guarded": solver.guarded}  # fmt: skip
     return changed, figures
 
 
@@ -369,7 +369,7 @@ def _hull_gaussians(
 
 def _figures(started: float, loss: float, solver: Solver) -> dict[str, float]:
     return {"seconds": time.monotonic() - started, "loss": loss, "gaussians": len(solver.model),
-            "changed": int(solver.rows.sum()), "iterations": solver.done,
+            "changed": int(solver.rows.sum()), "iterations": solver.done, "guarded": solver.guarded,
             "saturated": solver.known_quantizer.saturation(solver.model.gaussians)}  # fmt: skip
 
 
