@@ -154,7 +154,7 @@ def parser() -> argparse.ArgumentParser:
     _render(command("render", "pipelines.commands:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands:evaluate", "score a scene against a capture"))
     _view(command("view", "pipelines.commands:view", "show a scene in the web browser"))
-    _bench(command("bench", "pipelines.bench:bench", "run one of the benchmarks"))
+    _bench(command("bench", "pipelines.measure:measure", "run one of the benchmarks"))
     command("doctor", "pipelines.doctor:doctor", "tell what this machine has and lacks")
     return top
 

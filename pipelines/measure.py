@@ -7,7 +7,7 @@ import runpy
 import sys
 
 
-def bench(arguments: argparse.Namespace) -> int:
+def measure(arguments: argparse.Namespace) -> int:
     """Run a benchmark as `python -m bench.NAME` does, with what follows its name."""
     sys.argv = [f"packuv bench {arguments.name}", *arguments.rest]
     runpy.run_module(f"bench.{arguments.name}", run_name="__main__")
