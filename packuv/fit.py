@@ -36,6 +36,7 @@ from packuv.start import (
     Bounds,
     Points,
     drawn,
+    empty_gaussians,
     find_bounds,
     first_gaussians,
     hull_points,
@@ -99,7 +100,8 @@ def fit_first(
     started = time.monotonic()
     shots = _shots(views, instant)
     still_shots = [Shot(views.cameras[s.camera], views.balanced(s.camera, s.pixels), known=s.known) for s in stills]
-    first = still_shots if len(still_shots) >= len(shots) else shots
+    with_background = len(still_shots) >= len(shots)
+    first = still_shots if with_background else shots
     bounds = find_bounds(views.cameras, near_share=options.near_share)
     rng = np.random.default_rng([options.seed, instant, 0])
     cameras, targets = [shot.camera for shot in first], [shot.target for shot in first]
@@ -114,12 +116,13 @@ def fit_first(
     solver.run([halved(shot) for shot in first], coarse, of=total, dense=True, ticks=ticks)
     if shell is not None:
         depths = (shell.depths(camera, index, bounds.near) for index, camera in enumerate(cameras))
-        first[:] = [replace(shot, depths=known) for shot, known in zip(first, depths, strict=True)]
-    if first is still_shots:
+        first = [replace(shot, depths=known) for shot, known in zip(first, depths, strict=True)]
+    if with_background:
         solver.run(first, round(total * options.background.iteration_share) - coarse, of=total, dense=True, ticks=ticks)
         masks = _before_background(views, instant, stills, motion)
-        born = _hull_gaussians(views, instant, masks, bounds, options, rng, options.sh_degree)
-        solver.append(rows_of(born, slice(0, max(0, options.density.cap - len(model)))))
+        solver.append(_hull_gaussians(views, instant, masks, bounds, options, rng, options.sh_degree))
+    else:
+        shots = first
     solver.run(shots, floating - solver.done, of=total, dense=True, ticks=ticks)
     solver.keep(solver.worth_keeping())
     model.gaussians = canonical(model.gaussians)
@@ -145,9 +148,9 @@ def fit_next(
     """Fit a keyframe from a neighbouring one, later or earlier.
 
     `masks` tell, per camera of `views`, what differs between the two instants, bool [H, W] (None: unknown, the whole
-    picture may). Gaussians that touch no mask keep every code. What stood before the background
-    and has gone is dropped, and new Gaussians are born in the hull of what stands
-    there now; `stills` may be empty, then nothing is known to have gone.
+    picture may). Gaussians that touch no mask keep every code. What stood before the background and has gone is
+    dropped, and new Gaussians are born in the hull of what stands there now; `stills` may be empty, then nothing is
+    known to have gone.
     """
     started = time.monotonic()
     bounds, quantizer = previous.bounds, previous.quantizer
@@ -164,8 +167,7 @@ def fit_next(
     solver.keep(~gone)
     solver.free(_labels(model.gaussians, quantizer, views, masks, bounds, options))
     seen = [mask if alone is None else alone for alone, mask in zip(after, masks, strict=True)]
-    born = _hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree)
-    solver.append(rows_of(born, slice(0, max(0, options.density.cap - len(model)))))
+    solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = _tiled(shots, masks, solver, views)
     loss = solver.run(shots, options.key_iterations, of=options.key_iterations, dense=True,
                       ticks=Ticks(progress, options.key_iterations))  # fmt: skip
@@ -389,7 +391,7 @@ class Track:
     def resume(cls, key: KeyState, options: FitOptions, scratch: Path) -> Track:
         """Where the last call was cut off, or at the keyframe."""
         model = Model(key.gaussians)
-        model.append(_empty_rows(options.spare, key))
+        model.append(empty_gaussians(options.spare, key.bounds, sh_degree=key.quantizer.sh_degree))
         track = cls(key, model, scratch)
         path = scratch / "track.json"
         if path.exists():
@@ -438,11 +440,3 @@ class Track:
             with np.load(self._scratch / f"frame_{number:06d}.npz") as data:
                 self.frames.append(Codes(data["xyz"], data["attributes"]))
         self.figures = figures
-
-
-def _empty_rows(count: int, key: KeyState) -> Gaussians:
-    """Rows that no renderer draws."""
-    centre = np.repeat(key.bounds.centre[None], count, axis=0)
-    rows = round_gaussians(centre, np.full((count, 3), 0.5), np.full(count, 0.01 * key.bounds.radius), opacity=0.5,
-                           sh_degree=key.quantizer.sh_degree)  # fmt: skip
-    return replace(rows, opacity_logits=np.full(count, OPACITY_RANGE[0], np.float32))

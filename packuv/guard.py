@@ -14,11 +14,11 @@ import numpy as np
 from numba import prange
 
 from packuv.model import ATTRIBUTES, Model
-from packuv.quantize import OPACITY_RANGE, Gaussians
+from packuv.quantize import Gaussians
 from packuv.raster.cpu import prefer_tbb
 from packuv.raster.kernel import kernel
 from packuv.raster.project import MAX_LENGTH, MAX_LOG_SCALE
-from packuv.start import Bounds
+from packuv.start import Bounds, empty_gaussians
 
 LIMITS = {"means": MAX_LENGTH, "log_scales": MAX_LOG_SCALE, "quaternions": 1e18, "opacity_logits": 1e18, "sh": 1e4}
 """Largest magnitude of a usable value: beyond, the rasterizer skips a Gaussian, or the loss leaves float32's range"""
@@ -49,7 +49,8 @@ class Guard:
         rows = np.flatnonzero(faults)
         if len(rows):
             self._report(model, None, faults, "at the start of a fit or of new rows", "is emptied")
-            model.overwrite(rows, self._empty(len(rows), model.gaussians.sh.shape[1]))
+            degree = math.isqrt(model.gaussians.sh.shape[1]) - 1
+            model.overwrite(rows, empty_gaussians(len(rows), self._bounds, sh_degree=degree))
             for name in ATTRIBUTES:
                 getattr(self._good, name)[rows] = getattr(model.gaussians, name)[rows]
 
@@ -90,17 +91,6 @@ class Guard:
         others = f", and so are {len(rows) - 1} more" if len(rows) > 1 else ""
         _log.warning("%s, %s of Gaussian %d is not finite or absurd (%s)%s; it %s and the fit goes on",
                      when, term, rows[0], _worst(source[rows[0]]), others, fate)  # fmt: skip
-
-    def _empty(self, count: int, coefficients: int) -> Gaussians:
-        """Rows that no renderer draws, at the scene's centre."""
-        size = max(0.01 * self._bounds.radius, 1e-12)
-        return Gaussians(
-            np.repeat(self._bounds.centre[None].astype(np.float32), count, axis=0),
-            np.full((count, 3), math.log(size), np.float32),
-            np.repeat(np.array([[1, 0, 0, 0]], np.float32), count, axis=0),
-            np.full(count, OPACITY_RANGE[0], np.float32),
-            np.zeros((count, coefficients, 3), np.float32),
-        )
 
 
 def _worst(values: np.ndarray) -> float:

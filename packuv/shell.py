@@ -20,6 +20,16 @@ from numba import njit, prange
 from packuv.camera import PinholeCamera
 from packuv.losses import SparseDepth
 from packuv.raster.cpu import prefer_tbb
+from packuv.raster.project import (
+    VIEW_CX,
+    VIEW_CY,
+    VIEW_FX,
+    VIEW_FY,
+    VIEW_HEIGHT,
+    VIEW_NEAR,
+    VIEW_WIDTH,
+    view_constants,
+)
 from packuv.start import Bounds, Points, drawn, pixels_of
 
 _JIT: dict[str, Any] = {"cache": True, "error_model": "numpy"}
@@ -186,7 +196,7 @@ def _agreed(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scene radius / distance where cameras agree best [V, U], who sees it [V, U, C], and where that is sure [V, U]."""
     prefer_tbb()
-    grey, views = _grey(pictures), np.stack([_view(camera) for camera in cameras])
+    grey, views = _grey(pictures), np.stack([view_constants(camera, bounds.near, 0.0) for camera in cameras])
     shape, count = rays.shape[:2], len(cameras)
     inverse = np.linspace(1 / options.nearest, 1 / options.farthest, options.steps)
     painted = np.empty((count, *shape), np.float32)
@@ -195,8 +205,7 @@ def _agreed(
     seers = np.zeros((*shape, count), np.bool_)
     rule = np.array([options.noise, options.camera_agreement])
     for index, value in enumerate(inverse):
-        limits = np.array([bounds.near, options.grazing])
-        _paint(rays, bounds.centre, bounds.radius / value, views, grey, limits, painted)
+        _paint(rays, bounds.centre, bounds.radius / value, views, grey, options.grazing, painted)
         _compare(painted, options.window // 2, rule, index, score, last, around, step, seers)
     sure = (score >= options.agreement) & (seers.sum(axis=2) >= options.cameras)
     sure &= (step > 0) & (step < options.steps - 1)
@@ -214,13 +223,6 @@ def _grey(pictures: Sequence[np.ndarray]) -> np.ndarray:
     for index, picture in enumerate(pictures):
         grey[index, : picture.shape[1], : picture.shape[2]] = picture.mean(axis=0)
     return grey
-
-
-def _view(camera: PinholeCamera) -> np.ndarray:
-    """float64 [18]: rotation 0-8, translation 9-11, fx fy cx cy 12-15, width, height."""
-    pose = camera.camera_from_world
-    lens = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
-    return np.array([*pose[:3, :3].ravel(), *pose[:3, 3], *lens])
 
 
 def _colours(
@@ -243,8 +245,11 @@ def _colours(
 
 
 @njit(parallel=True, **_JIT)
-def _paint(rays, centre, distance, views, grey, limits, painted):
-    """Each camera's brightness in each direction on the sphere, NaN where the camera does not see it."""
+def _paint(rays, centre, distance, views, grey, grazing, painted):
+    """Each camera's brightness in each direction on the sphere, NaN where the camera does not see it.
+
+    `views` holds the rasterizer's constants of each camera.
+    """
     for v in prange(rays.shape[0]):
         for u in range(rays.shape[1]):
             dx, dy, dz = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
@@ -253,18 +258,18 @@ def _paint(rays, centre, distance, views, grey, limits, painted):
                 w = views[c]
                 painted[c, v, u] = np.nan
                 z = w[6] * px + w[7] * py + w[8] * pz + w[11]
-                if z < limits[0]:
+                if z < w[VIEW_NEAR]:
                     continue
                 x = w[0] * px + w[1] * py + w[2] * pz + w[9]
                 y = w[3] * px + w[4] * py + w[5] * pz + w[10]
-                column, row = w[12] * x / z + w[14] - 0.5, w[13] * y / z + w[15] - 0.5
-                if not (column >= 0 and row >= 0 and column < w[16] - 1 and row < w[17] - 1):
+                column, row = w[VIEW_FX] * x / z + w[VIEW_CX] - 0.5, w[VIEW_FY] * y / z + w[VIEW_CY] - 0.5
+                if not (column >= 0 and row >= 0 and column < w[VIEW_WIDTH] - 1 and row < w[VIEW_HEIGHT] - 1):
                     continue
                 normal_x = w[0] * dx + w[1] * dy + w[2] * dz
                 normal_y = w[3] * dx + w[4] * dy + w[5] * dz
                 normal_z = w[6] * dx + w[7] * dy + w[8] * dz
                 outward = x * normal_x + y * normal_y + z * normal_z
-                if outward < limits[1] * math.sqrt(x * x + y * y + z * z):
+                if outward < grazing * math.sqrt(x * x + y * y + z * z):
                     continue
                 i, j = int(row), int(column)
                 a, b = np.float32(row - i), np.float32(column - j)

@@ -167,7 +167,8 @@ class Solver:
         self._guard.check(self.model, None, rows, "before the first iteration")
 
     def append(self, born: Gaussians) -> None:
-        """Add Gaussians that may change."""
+        """Add Gaussians that may change, the first ones as far as the cap leaves room."""
+        born = rows_of(born, slice(0, max(0, self._options.density.cap - len(self.model))))
         self.model.append(born)
         self.rows = np.concatenate([self.rows, np.ones(len(born), bool)])
         self._start_afresh()

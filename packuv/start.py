@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit, prange
 
 from packuv.camera import PinholeCamera
-from packuv.quantize import Gaussians
+from packuv.quantize import OPACITY_RANGE, Gaussians
 
 SH_BASE = 0.28209479177387814
 """Value of the constant spherical harmonic"""
@@ -123,6 +123,13 @@ def round_gaussians(
         opacity_logits=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
         sh=sh,
     )
+
+
+def empty_gaussians(count: int, bounds: Bounds, *, sh_degree: int) -> Gaussians:
+    """Rows at the scene's centre that no renderer draws: place for what comes later."""
+    centre, size = np.repeat(bounds.centre[None], count, axis=0), max(0.01 * bounds.radius, 1e-12)
+    rows = round_gaussians(centre, np.full((count, 3), 0.5), np.full(count, size), opacity=0.5, sh_degree=sh_degree)
+    return replace(rows, opacity_logits=np.full(count, OPACITY_RANGE[0], np.float32))
 
 
 def seen_colours(

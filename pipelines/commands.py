@@ -93,7 +93,7 @@ def _verify_scene(arguments: argparse.Namespace) -> int:
     with shown(arguments, "verify") as progress:
         report = verify_scene(arguments.scene, progress=progress)
     facts = {"frames": report.frames, "bad": list(report.bad), "problem": report.problem, "ok": report.ok}
-    good = f"{arguments.scene}: all {report.frames} frames decode to exactly what was fitted"
+    good = f"{arguments.scene}: all {report.frames} frames decode to exactly what was written"
     bad = f"{arguments.scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
     print_facts(facts, arguments.json, lambda _: good if report.ok else bad)
     return 0 if report.ok else 1

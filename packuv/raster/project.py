@@ -37,8 +37,10 @@ SHEAR, INVERSE_XX, INVERSE_VARIANCE_Y, REACH = range(10, 14)
 RECORD = 16
 
 # Entries of a view.
-_ROTATION, _TRANSLATION, _FX, _FY, _CX, _CY, _CENTRE, _WIDTH, _HEIGHT = 0, 9, 12, 13, 14, 15, 16, 19, 20
-_SLOPE_LIMITS, _NEAR, _LOW_PASS = 21, 25, 26
+_ROTATION, _TRANSLATION, _CENTRE = 0, 9, 16
+VIEW_FX, VIEW_FY, VIEW_CX, VIEW_CY = 12, 13, 14, 15
+VIEW_WIDTH, VIEW_HEIGHT = 19, 20
+_SLOPE_LIMITS, VIEW_NEAR, _LOW_PASS = 21, 25, 26
 
 EXPONENT_UNIT = 8.0
 _LOG2E = 1.4426950408889634
@@ -77,7 +79,7 @@ def _linear_map(view, u, v, inverse_z):
     after the camera's rotation, [2, 3] by rows."""
     u = min(max(u, view[_SLOPE_LIMITS]), view[_SLOPE_LIMITS + 1])
     v = min(max(v, view[_SLOPE_LIMITS + 2]), view[_SLOPE_LIMITS + 3])
-    a, b = view[_FX] * inverse_z, view[_FY] * inverse_z
+    a, b = view[VIEW_FX] * inverse_z, view[VIEW_FY] * inverse_z
     c, d = -a * u, -b * v
     return (a, c, b, d), (
         a * view[0] + c * view[6], a * view[1] + c * view[7], a * view[2] + c * view[8],
@@ -138,8 +140,8 @@ def _is_valid(means, log_scales, quaternions, logits, i):
 def _touches(view, x, y, half_x, half_y, active_sum, box, i):
     """Write the tiles [x0, y0, x1, y1], both ends included, that a box of pixels touches; False if none is active."""
     # Clamped before they become integers, which far positions would overflow.
-    x0, x1 = max(x - half_x - 0.5, 0.0), min(x + half_x - 0.5, view[_WIDTH] - 1)
-    y0, y1 = max(y - half_y - 0.5, 0.0), min(y + half_y - 0.5, view[_HEIGHT] - 1)
+    x0, x1 = max(x - half_x - 0.5, 0.0), min(x + half_x - 0.5, view[VIEW_WIDTH] - 1)
+    y0, y1 = max(y - half_y - 0.5, 0.0), min(y + half_y - 0.5, view[VIEW_HEIGHT] - 1)
     if not (x0 <= x1 and y0 <= y1):
         return False
     left, top, right, bottom = math.ceil(x0), math.ceil(y0), int(x1), int(y1)
@@ -177,11 +179,11 @@ def _colour(view, means, sh, degree, values, record, i):
 def _project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
     """Fill the record (but for the colour) and the box of one valid Gaussian; False if it is not drawn."""
     x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
-    if not (z >= view[_NEAR] and logits[i] >= _LOGIT_MIN):
+    if not (z >= view[VIEW_NEAR] and logits[i] >= _LOGIT_MIN):
         return False
     inverse_z = 1.0 / z
     u, v = x * inverse_z, y * inverse_z
-    px, py = view[_FX] * u + view[_CX], view[_FY] * v + view[_CY]
+    px, py = view[VIEW_FX] * u + view[VIEW_CX], view[VIEW_FY] * v + view[VIEW_CY]
     (a, b, c, d), axes = _linear_map(view, u, v, inverse_z)
     # A circle around the largest ellipse that these scales allow spares most Gaussians that are not drawn the rest.
     size = math.exp(max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2])))
@@ -318,7 +320,7 @@ def _map_gradient(view, d, r):
 @kernel(inline=True, fastmath=_FAST)
 def _point_gradient(view, u, v, inverse_z, d_depth, screen, jacobian, d_jacobian):
     """Gradient of the position, world, from those of the depth, the picture's position and the Jacobian."""
-    px, py = screen[0] * view[_FX] * inverse_z, screen[1] * view[_FY] * inverse_z
+    px, py = screen[0] * view[VIEW_FX] * inverse_z, screen[1] * view[VIEW_FY] * inverse_z
     pz = d_depth - px * u - py * v
     a, c, b, d = jacobian
     pz -= (d_jacobian[0] * a + d_jacobian[1] * c + d_jacobian[2] * b + d_jacobian[3] * d) * inverse_z
