@@ -40,6 +40,7 @@ ROWS: Mapping[str, Sequence[str]] = {
     "w/o LPO": ("fit.low_precision=false",),
     "w/o shell": ("fit.shell.enabled=false",),
     "w/o background": ("fit.background.iteration_share=0",),
+    "w/o random background": ("fit.random_background=false",),
     "w/o lifted motion": ("fit.lift.enabled=false",),
     "w/o depth term": ("fit.depth_weight=0",),
     "labels by OR (paper)": ("fit.labels.least_overlap=0", "fit.labels.least_share=0"),

@@ -147,7 +147,9 @@ def fit_case(
 ) -> Outcome:
     """Fit from `start` to the targets, in floats or through codes."""
     bounds = find_bounds(cameras, near_share=near_share)
-    options = FitOptions(sh_degree=start.sh_degree, near_jitter=0.0, opacity_weight=0.01, scale_weight=0.01)
+    options = FitOptions(
+        sh_degree=start.sh_degree, near_jitter=0.0, random_background=False, opacity_weight=0.01, scale_weight=0.01
+    )
     solver = Solver(Model(start), bounds, options, np.random.default_rng(0))
     if quantized:
         solver.fix(choose_quantizer(solver.model.gaussians, bounds, start.sh_degree))

@@ -46,7 +46,7 @@ from packuv.start import (
     round_gaussians,
 )
 
-VERSION = 3
+VERSION = 4
 """Raised with every change that alters what a fit returns"""
 
 DEAD_CODE = 1

@@ -13,14 +13,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import av
 import cv2
 import numpy as np
-from torchcodec.decoders import VideoDecoder
 
 from packuv.camera import PinholeCamera
+
+if TYPE_CHECKING:
+    from torchcodec.decoders import VideoDecoder
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """Coefficient counts that OpenCV's lens model knows, see `LensCamera.distortion`."""
@@ -116,6 +118,8 @@ class FrameReader:
         with self._guard:
             decoder = self._decoders.pop(camera, None)
         if decoder is None:
+            from torchcodec.decoders import VideoDecoder  # takes seconds, and torch; many processes read no video
+
             decoder = VideoDecoder(
                 str(self.videos[camera]), dimension_order="NHWC", num_ffmpeg_threads=self._threads, seek_mode="exact"
             )

@@ -24,6 +24,9 @@ from packuv.uvmap import UvOptions
 
 Progress = Callable[[int, int], None]
 
+_VOID = 16 / 255
+"""A pixel whose channels are all below may show nothing: decoded black is not quite black"""
+
 
 class Ticks:
     """Counts work done and tells whoever asked."""
@@ -64,6 +67,9 @@ class FitOptions:
     camera cannot explain its picture then"""
     near_reach: float = 0.7
     """In scene radii"""
+    random_background: bool = True
+    """Draw keyframes before a colour at random in each iteration, but where a picture is black: what it shows must then
+    be covered, and no camera can be explained by leaving a place half transparent"""
     depth_weight: float = 0.05
     """Of the mean error of depth, in scene radii, where the background's shell is sure (paper, objective)"""
     opacity_weight: float = 0.0
@@ -185,7 +191,7 @@ class Solver:
         losses = []
         self._order = []
         for _ in range(count):
-            losses.append(self._iterate(shots, progress=self.done / of))
+            losses.append(self._iterate(shots, progress=self.done / of, opaque=self._options.random_background))
             if dense and self.done % self._options.density.every == 0 and self.done < of * self._options.density.until:
                 self._round(of)
             if ticks:
@@ -211,20 +217,25 @@ class Solver:
             best = min(best, mean)
         return mean, done
 
-    def _iterate(self, shots: Sequence[Shot], *, progress: float, scale: float = 1.0) -> float:
+    def _iterate(self, shots: Sequence[Shot], *, progress: float, scale: float = 1.0, opaque: bool = False) -> float:
         if not self._order:
             self._order = list(self._rng.permutation(len(shots)))
         shot = shots[self._order.pop()]
         options, drawn = self._options, self._decoded()
         rendering = render(drawn, shot.camera, options=RasterOptions(self._near()), tiles=shot.tiles,
                            workspace=self._workspace)  # fmt: skip
+        behind = self._behind(shot.target) if opaque else None
+        picture = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
         # What is not known is taken for right as it is.
-        target = shot.target if shot.known is None else np.where(shot.known, shot.target, rendering.colour)
-        loss = photometric_loss(rendering.colour, target, options=options.photometric, tiles=shot.tiles)
+        target = shot.target if shot.known is None else np.where(shot.known, shot.target, picture)
+        loss = photometric_loss(picture, target, options=options.photometric, tiles=shot.tiles)
         if not np.isfinite(loss.value):
             raise ValueError(f"the loss of camera {shot.camera.name!r} is {loss.value} in iteration {self.done}: its "
                              "picture or the Gaussians hold values that are not finite")  # fmt: skip
-        found = gradients(rendering, loss.gradient, *self._depth_gradients(rendering, shot), rows=self.rows)
+        d_depth, d_alpha = self._depth_gradients(rendering, shot)
+        if behind is not None:
+            d_alpha = d_alpha - (loss.gradient * behind).sum(axis=0)
+        found = gradients(rendering, loss.gradient, d_depth, d_alpha, rows=self.rows)
         self.gradient.add(found.means2d, rendering.visible, shot.camera.width, shot.camera.height)
         moving = self.rows & (rendering.visible > 0)
         values = {name: getattr(found, name) for name in ATTRIBUTES}
@@ -235,10 +246,15 @@ class Solver:
         self.done += 1
         return loss.value
 
-    def _depth_gradients(self, rendering: Rendering, shot: Shot) -> tuple[np.ndarray | None, np.ndarray | None]:
+    def _behind(self, target: np.ndarray) -> np.ndarray:
+        """A colour at random behind all Gaussians, black where the target is, float32 [3, H, W]."""
+        colour = self._rng.random(3).astype(np.float32)
+        return colour[:, None, None] * (target.max(axis=0) > _VOID)
+
+    def _depth_gradients(self, rendering: Rendering, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
         weight = np.float32(self._options.depth_weight)
         if shot.depths is None or not weight:
-            return None, None
+            return np.zeros_like(rendering.depth), np.zeros_like(rendering.alpha)
         _, d_depth, d_alpha = depth_loss(rendering.depth, rendering.alpha, shot.depths, scale=self.bounds.radius)
         return weight * d_depth, weight * d_alpha
 

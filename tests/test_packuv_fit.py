@@ -20,7 +20,7 @@ from packuv.start import StartOptions, round_gaussians
 FRAMES = 4
 OPTIONS = FitOptions(
     iterations=150, key_iterations=40, frame_iterations=48, spare=40, key_births=60, near_jitter=0.0,
-    start=StartOptions(count=500), density=DensityOptions(cap=900, every=25),
+    random_background=False, start=StartOptions(count=500), density=DensityOptions(cap=900, every=25),
 )  # fmt: skip
 MOTION = MotionOptions(width=96, flow_width=96, least_area_px=4, closing_px=1, dilation_px=1)
 
