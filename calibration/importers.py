@@ -23,7 +23,10 @@ import numpy as np
 
 from calibration.rig import Camera, Rig
 
-_PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".exr"}
+_PICTURE_SUFFIXES = {
+    ".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".mp4", ".mov", ".mkv", ".avi", ".webm", ".mxf",
+}  # fmt: skip
+_NAMES_SHOWN = 8
 # COLMAP's model number: name and count of parameters (src/colmap/sensor/models.h).
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
@@ -136,9 +139,16 @@ def _covering(schemes: Sequence[dict[str, list[Camera]]], names: Sequence[str], 
         if set(names) <= set(scheme):
             return scheme
     raise ValueError(
-        f"every video needs a camera of its name in {file}; videos: {sorted(set(names))}; "
-        f"cameras: {sorted(schemes[0])}; videos without a camera: {sorted(set(names) - set(schemes[0]))}"
+        f"every video needs a camera of its name in {file}; videos without one: {_some(set(names) - set(schemes[0]))}; "
+        f"the file's cameras: {_some(schemes[0])}"
     )
+
+
+def _some(names: Iterable[str]) -> str:
+    """The first names in order, and how many more there are."""
+    ordered = sorted(names)
+    more = len(ordered) - _NAMES_SHOWN
+    return ", ".join(ordered[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def _agreeing(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,16 @@ class Camera:
     def forward(self) -> np.ndarray:
         """Unit viewing direction, world, float64 [3]."""
         return self.camera_from_world[2, :3].copy()
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera with pictures scaled to another size; raises ValueError if that would stretch them."""
+        if abs(self.height * width / self.width - height) >= 1 and abs(self.width * height / self.height - width) >= 1:
+            raise ValueError(
+                f"camera {self.name!r} must film in the shape it was calibrated in, {self.width}x{self.height}, "
+                f"but its video is {width}x{height}; crop neither, or calibrate again"
+            )
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points [N, 3] to pixels of the distorted picture [N, 2] and depth [N].
@@ -134,6 +144,10 @@ class Rig:
     def select(self, names: Iterable[str]) -> Rig:
         """The rig of the named cameras, in that order; raises KeyError for a name it lacks."""
         return Rig(tuple(self[name] for name in names), self.source, self.metric)
+
+    def resized(self, sizes: Mapping[str, tuple[int, int]]) -> Rig:
+        """The rig with pictures of these widths and heights, by camera."""
+        return replace(self, cameras=tuple(camera.resized(*sizes[camera.name]) for camera in self.cameras))
 
     def save(self, path: Path) -> None:
         """Write JSON; docs/calibration.md names every field."""

@@ -25,6 +25,7 @@ from tasks.footage import RIG, Footage
 from tasks.jobs import Progress
 from tasks.plan import Plan
 from tasks.store import Key
+from tasks.synchronize import read_videos
 from tasks.workshop import Workshop
 
 RIG_VERSION = 1
@@ -101,7 +102,8 @@ def build_import(
     footage: Footage, calibration: Path, first: int, options: RigOptions, out: Path, progress: Progress
 ) -> dict[str, Any]:
     """The job behind `find_rig` where a calibration is given."""
-    rig = load_rig(calibration, footage.cameras)
+    sizes = {name: (video["width"], video["height"]) for name, video in read_videos(footage.groups).items()}
+    rig = load_rig(calibration, footage.cameras).resized(sizes)
     progress(0, 1, "comparing the calibration with the pictures")
     judgement = judge(rig, filmed(footage, first), options=options.judge)
     if judgement.matches.verdict is Verdict.REJECTED and not options.trust:

@@ -123,3 +123,13 @@ def test_the_file_holds_what_the_docs_list(tmp_path):
     data = json.loads((tmp_path / "rig.json").read_text())
     assert sorted(data) == ["cameras", "metric", "source"]
     assert sorted(data["cameras"][0]) == sorted(field.name for field in fields(Camera))
+
+
+def test_another_picture_size_scales_pixels_and_another_shape_is_refused():
+    camera = replace(ring(1).cameras[0], distortion=(0.05, -0.02, 0.001, 0.002))
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (20, 3))
+    half = camera.resized(camera.width // 2, camera.height // 2)
+    assert np.abs(2 * half.project(points)[0] - camera.project(points)[0]).max() < 1e-9
+    assert (half.width, half.height) == (camera.width // 2, camera.height // 2)
+    with pytest.raises(ValueError, match="must film in the shape it was calibrated in"):
+        camera.resized(camera.width, camera.height // 2)
