@@ -214,11 +214,16 @@ class Artist:
 
 def _compare(picture: np.ndarray, truth: np.ndarray, balanced: np.ndarray) -> list[Any]:
     """The six figures of a `Score`."""
-    values: list[Any] = []
-    for first, second in ((picture, truth), (picture, balanced), (with_own_gain(picture, truth), truth)):
-        decibel = psnr(first, second)
-        values += [decibel if math.isfinite(decibel) else None, ssim(first, second)]
-    return values
+    as_filmed = _likeness(picture, truth)
+    # A camera that is held out has no gain: what it filmed is the rig's colour.
+    in_rig = as_filmed if np.array_equal(truth, balanced) else _likeness(picture, balanced)
+    return [*as_filmed, *in_rig, *_likeness(with_own_gain(picture, truth), truth)]
+
+
+def _likeness(picture: np.ndarray, truth: np.ndarray) -> tuple[float | None, float]:
+    """PSNR, None where the two are equal, and SSIM."""
+    decibel = psnr(picture, truth)
+    return decibel if math.isfinite(decibel) else None, ssim(picture, truth)
 
 
 def with_own_gain(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
