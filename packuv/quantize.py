@@ -130,15 +130,17 @@ class Quantizer:
                 255 / (self.high - self.low), xyz, attributes)  # fmt: skip
         return Codes(xyz, attributes)
 
-    def decode(self, codes: Codes) -> Gaussians:
-        """Exactly the floats that the fit rendered."""
+    def decode(self, codes: Codes, *, into: Gaussians | None = None) -> Gaussians:
+        """Exactly the floats that the fit rendered, written to the first rows of `into` if that is given."""
         if codes.attributes.shape[1] != len(self.low):
             raise ValueError(f"codes have {codes.attributes.shape[1]} columns, the quantizer {len(self.low)}")
         count, coefficients = len(codes), (self.sh_degree + 1) ** 2
-        shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, 3 * coefficients)]
-        out = [np.empty(shape, np.float32) for shape in shapes]
-        _decode(codes.xyz, codes.attributes, self.xyz_table, self.attribute_table, *out)
-        return Gaussians(out[0], out[1], out[2], out[3], out[4].reshape(count, coefficients, 3))
+        if into is None:
+            shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, coefficients, 3)]
+            into = Gaussians(*(np.empty(shape, np.float32) for shape in shapes))
+        _decode(codes.xyz, codes.attributes, self.xyz_table, self.attribute_table, into.means, into.log_scales,
+                into.quaternions, into.opacity_logits, into.sh.reshape(len(into), -1))  # fmt: skip
+        return into
 
     def saturation(self, gaussians: Gaussians) -> int:
         """Number of values that lie more than half a step outside their range."""

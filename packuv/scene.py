@@ -6,7 +6,8 @@ may change inside a segment come first.
     with packuv.open("scene.mkv") as scene:
         for gaussians in scene:             # float32 arrays, the next frames being decoded meanwhile
             ...
-        scene.gaussians(scene.frame_at(time_ns))
+        shown = scene.gaussians(scene.frame_at(time_ns))
+        shown = scene.gaussians(7, into=shown)      # in place: what stands still is not written again
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ class Scene:
         self._keys: dict[int, Codes] = {}  # of the segment at hand and those on the way to it, as their keys were
         self._segment = self._frame = -1
         self._playback: Playback | None = None
-        self._still: Gaussians | None = None  # the segment's rows that do not change
+        self._shown: tuple[Gaussians, int] | None = None  # what `gaussians` returned last, and its segment
 
     def __enter__(self) -> Scene:
         return self
@@ -181,19 +182,23 @@ class Scene:
         codes = self._seek(frame)
         return Codes(codes.xyz.copy(), codes.attributes.copy())
 
-    def gaussians(self, frame: int) -> Gaussians:
-        """All Gaussians of a frame as floats, in the order of `codes`; yours to change."""
+    def gaussians(self, frame: int, *, into: Gaussians | None = None) -> Gaussians:
+        """All Gaussians of a frame as floats, in the order of `codes`; yours to change.
+
+        With `into`, what the last call returned and nobody has changed, the same arrays come back with this frame in
+        them if it lies in the same segment: only rows that may move are written.
+        """
         codes = self._seek(frame)
-        quantizer, dynamic = self.header.quantizer, self.index.segments[self._segment].dynamic
-        if self._still is None:
-            self._still = quantizer.decode(codes[dynamic:])
-        moving = quantizer.decode(codes[:dynamic])
-        parts = zip(vars(moving).values(), vars(self._still).values(), strict=True)
-        return Gaussians(*(np.concatenate(part) for part in parts))
+        if self._shown and self._shown[0] is into and self._shown[1] == self._segment:
+            dynamic = self.index.segments[self._segment].dynamic
+            return self.header.quantizer.decode(codes[:dynamic], into=into)
+        shown = self.header.quantizer.decode(codes)
+        self._shown = shown, self._segment
+        return shown
 
     def _forget(self) -> None:
         self._segment = self._frame = -1
-        self._playback = self._still = None
+        self._playback = None
 
     def _seek(self, frame: int) -> Codes:
         """Bring the playback to a frame; on an error nothing half-done stays behind."""

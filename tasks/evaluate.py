@@ -160,8 +160,9 @@ def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
     """
     artist, scores = Artist(scene), []
     last: dict[str, np.ndarray] = {}
+    gaussians = None
     for frame in range(len(scene)):
-        gaussians = scene.gaussians(frame)
+        gaussians = scene.gaussians(frame, into=gaussians)
         for index, camera in enumerate(views.cameras):
             pixels, balanced = views.pixels(index, frame), views.picture(index, frame)
             if pixels is not None and balanced is not None:

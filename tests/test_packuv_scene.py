@@ -172,6 +172,17 @@ def test_floats_are_those_of_the_quantizer(scene_file):
                 assert np.array_equal(getattr(got, name), getattr(expected, name))
 
 
+@pytest.mark.parametrize("order", [range(21), (20, 3, 4, 4, 12, 0, 1, 13), (5, 2, 5)], ids=["on", "jumps", "back"])
+def test_floats_in_place_are_the_same(scene_file, order):
+    path, frames = scene_file
+    shown = None
+    with open_scene(path) as scene:
+        for frame in order:
+            shown, expected = scene.gaussians(frame, into=shown), quantizer().decode(frames[frame])
+            for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+                assert np.array_equal(getattr(shown, name), getattr(expected, name))
+
+
 def test_codes_are_the_callers_own(scene_file):
     path, frames = scene_file
     with open_scene(path) as scene:

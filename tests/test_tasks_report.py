@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from calibration.accept import check_rig
@@ -360,6 +360,7 @@ def test_charts_of_any_numbers_are_sound(values: list[float], marks: list[int], 
 
 
 @given(st.lists(st.floats(0, 1e12), max_size=40))
+@example([5e-324])
 def test_bars_stand_on_zero_and_keep_their_ratio(values: list[float]) -> None:
     root = svg_root(bar_chart(values, title="t", x_label="x", y_label="y", strong=[0]))
     heights = [float(bar.get("height", "nan")) for bar in root.iter("rect")]
