@@ -344,7 +344,7 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _ceiling(value: float) -> float:
-    """The least of 1, 2, 5 times a power of ten that is not below a positive value; 1 for what is as good as nothing."""
+    """The least of 1, 2, 5 times a power of ten that is not below a positive value; 1 for as good as nothing."""
     if value < 1e-300:  # powers of ten end before denormal numbers do
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
