@@ -51,6 +51,8 @@ def info(arguments: argparse.Namespace) -> int:
             "seconds": float((header.times_ns[-1] - header.times_ns[0]) / 1e9 + 1 / header.rate),
             "bytes_per_frame": size / len(scene),
             "sh_degree": header.quantizer.sh_degree,
+            "lossless": index.tolerance.exact,
+            "tolerance": vars(index.tolerance),
             "cameras": [camera.name for camera in header.cameras],
             "held_out": list(header.held_out),
             "segments": [
@@ -69,6 +71,8 @@ def _info_text(facts: Mapping[str, Any]) -> str:
     counts = [segment["gaussians"] for segment in facts["segments"]]
     moving = [segment["dynamic"] for segment in facts["segments"]]
     held_out = f" (held out: {', '.join(facts['held_out'])})" if facts["held_out"] else ""
+    within = "within {position} steps of a position and {attribute} of any other code, of what was fitted"
+    exact = "exactly as fitted" if facts["lossless"] else within.format(**facts["tolerance"])
     return "\n".join(
         [
             f"{facts['file']}: {size_text(facts['bytes'])}, {size_text(facts['bytes_per_frame'])} a frame",
@@ -76,6 +80,7 @@ def _info_text(facts: Mapping[str, Any]) -> str:
             f"segments   {len(counts)}, from frame {', '.join(str(s['first']) for s in facts['segments'])}",
             f"gaussians  {min(counts):,} to {max(counts):,}, of which {min(moving):,} to {max(moving):,} move; "
             f"SH degree {facts['sh_degree']}",
+            f"codes      {exact}",
             f"cameras    {len(facts['cameras'])}{held_out}",
             f"tools      {', '.join(f'{name} {version}' for name, version in facts['tools'].items())}",
         ]
@@ -92,7 +97,7 @@ def _verify_scene(arguments: argparse.Namespace) -> int:
 
     with shown(arguments, "verify") as progress:
         report = verify_scene(arguments.scene, progress=progress)
-    facts = {"frames": report.frames, "bad": list(report.bad), "problem": report.problem, "ok": report.ok}
+    facts = {**vars(report), "ok": report.ok}
     good = f"{arguments.scene}: all {report.frames} frames decode to exactly what was written"
     bad = f"{arguments.scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
     print_facts(facts, arguments.json, lambda _: good if report.ok else bad)

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from packuv.scene import open_scene
+from pipelines.cli import main
 from pipelines.process import Outcome, process, process_directly
 from pipelines.progress import TerminalProgress
 from pipelines.request import RunRequest
@@ -99,6 +100,23 @@ def test_run_leaves_scene_report_and_record(first, capture):
     assert Store(outcome.folder / "store").verify() == []
     assert not [path for path in (outcome.folder / "store" / ".work").iterdir() if path.is_dir()]
     assert outcome.scene.stat().st_nlink == 2
+
+
+def test_info_and_verify_tell_what_the_scene_is(first, capsys, tmp_path):
+    scene = first[0].scene
+    assert main(["info", str(scene), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["frames"], facts["lossless"], facts["held_out"]) == (FRAMES, True, ["cam03"])
+    assert main(["verify", str(scene)]) == 0
+    assert "all 6 frames decode to exactly what was written" in capsys.readouterr().out
+    damaged = tmp_path / "damaged.mkv"
+    data = bytearray(scene.read_bytes())
+    data[len(data) // 2] ^= 1
+    damaged.write_bytes(data)
+    assert main(["verify", str(damaged), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["bad"]
+    assert found["span"][0] <= len(data) // 2 < found["span"][1]
 
 
 def test_same_command_finds_everything_there(first, capture):
