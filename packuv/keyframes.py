@@ -48,14 +48,17 @@ class KeyframeOptions:
     """At most this many peaks, the highest (the paper's m - 1); None: all that stand out"""
     prominence: float = 0.1
     """How far a peak must rise above the valleys on its sides, share of the highest M(t)"""
-
     promotion: float = 1.6
     """A frame whose loss after its fit exceeds that of its segment's first half `separation` of frames by this factor
     becomes a keyframe: something came into view, or the chain has drifted; 0: never"""
+    seam: float = 1.6
+    """A border between segments that flickers more than this times what the segment before it does is mended: the later
+    segment is fitted again from the end of the earlier one, after it instead of beside it; 0: never"""
 
     def __post_init__(self) -> None:
-        if self.promotion != 0 and not self.promotion > 1:
-            raise ValueError(f"promotion must be a factor above 1, or 0 for never, but is {self.promotion}")
+        for name, factor in (("promotion", self.promotion), ("seam", self.seam)):
+            if factor != 0 and not factor > 1:
+                raise ValueError(f"{name} must be a factor above 1, or 0 for never, but is {factor}")
         if self.smoothing < 1 or self.smoothing % 2 == 0 or self.separation < 1 or (self.peaks or 0) < 0:
             raise ValueError(
                 "smoothing must be odd and positive, separation positive and peaks not negative, but they are "

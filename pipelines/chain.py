@@ -1,4 +1,5 @@
-"""The fits of a sequence: a chain of keyframes, segments beside it, and keyframes that a segment turns out to need."""
+"""The fits of a sequence: a chain of keyframes, segments beside it, keyframes that a segment turns out to need, and
+borders between segments that show."""
 
 from __future__ import annotations
 
@@ -9,7 +10,16 @@ from typing import Any, Protocol
 from packuv.keyframes import fitting_order, promoted
 from pipelines.options import SequenceOptions
 from tasks.plan import Plan
-from tasks.splat import count_pictures, cut_segment, fit_first, fit_next, fit_segment, read_losses
+from tasks.splat import (
+    count_pictures,
+    cut_segment,
+    fit_first,
+    fit_next,
+    fit_segment,
+    measure_seam,
+    read_losses,
+    read_seam,
+)
 from tasks.store import Key
 from tasks.workshop import Workshop
 
@@ -22,6 +32,8 @@ class Future(Protocol):
 
 
 Submit = Callable[..., Future]
+Piece = tuple[Key, Future, range]
+"""A keyframe, its segment and the segment's instants"""
 
 
 @dataclass(frozen=True)
@@ -51,26 +63,48 @@ class Chain:
             segments[last] = self._segment(keys[last], spans[last])
             keys[index], last = following.result(), index
         segments[last] = self._segment(keys[last], spans[last])
-        for index, span in enumerate(spans):
-            yield from self._promote(keys[index], segments[index].result(), span)
+        pieces = ((keys[i], segments[i], span) for i, span in enumerate(spans))
+        before: Piece | None = None
+        for piece in (part for whole in pieces for part in self._promote(*whole)):
+            if before and self._shows(before, piece):
+                piece = self._continue(before, piece[2])
+            before = piece
+            yield piece[0], piece[1].result()
 
-    def _promote(self, key: Key, segment: Key, span: range) -> list[tuple[Key, Key]]:
+    def _promote(self, key: Key, segment: Future, span: range) -> Iterator[Piece]:
         """The segment, cut where the fit of a frame shows that a keyframe is missing."""
-        frame = promoted(read_losses(self.workshop, segment), self.options.keyframes)
+        frame = promoted(read_losses(self.workshop, segment.result()), self.options.keyframes)
         if frame is None:
-            return [(key, segment)]
-        rest = range(span.start + frame, span.stop)
+            yield key, segment, span
+            return
+        head, rest = range(span.start, span.start + frame), range(span.start + frame, span.stop)
         after = self._next(key, (span.start, rest.start)).result()
-        head = self.submit(cut_segment, self.workshop, segment, frame).result()
-        return [(key, head), *self._promote(after, self._segment(after, rest).result(), rest)]
+        yield key, self.submit(cut_segment, self.workshop, segment.result(), frame), head
+        yield from self._promote(after, self._segment(after, rest), rest)
+
+    def _shows(self, before: Piece, piece: Piece) -> bool:
+        """Whether the border between two segments flickers more than the first one does by itself."""
+        limit, (key, segment, span) = self.options.keyframes.seam, before
+        if not limit or len(span) < 2:
+            return False
+        sources = (self.workshop, self.plan, self.groups, self.points)
+        measured = self.submit(measure_seam, *sources, key, segment.result(), piece[0], self.options.pictures)
+        ratio = read_seam(self.workshop, measured.result())
+        return ratio is not None and ratio > limit
+
+    def _continue(self, before: Piece, span: range) -> Piece:
+        """A segment fitted again, from the end of the one before it."""
+        key, segment, earlier = before
+        again = self._next(key, (earlier.stop - 1, span.start), segment.result()).result()
+        return again, self._segment(again, span), span
 
     def _first(self, instant: int) -> Future:
         sources, options = (self.workshop, self.plan, self.groups, self.points, self.background), self.options
         return self.submit(fit_first, *sources, instant, options.pictures, options.motion, options.fit)
 
-    def _next(self, key: Key, step: tuple[int, int]) -> Future:
+    def _next(self, key: Key, step: tuple[int, int], end: Key | None = None) -> Future:
         sources, options = (self.workshop, self.plan, self.groups, self.points, self.background), self.options
-        return self.submit(fit_next, *sources, key, step, options.pictures, options.motion, options.fit)
+        return self.submit(fit_next, *sources, key, end, step, options.pictures, options.motion, options.fit)
 
     def _segment(self, key: Key, span: range) -> Future:
         sources, options = (self.workshop, self.plan, self.groups, self.points, self.motion), self.options

@@ -38,7 +38,7 @@ class SequenceOptions:
 _PRESETS: Mapping[str, Mapping[str, Any]] = {
     "draft": {
         "pictures": {"max_width": 640},
-        "fit": {"iterations": 2500, "key_iterations": 700, "frame_iterations": 72},
+        "fit": {"iterations": 1200, "key_iterations": 300, "frame_iterations": 48},
     },
     "standard": {
         "pictures": {"max_width": 1280},

@@ -19,6 +19,7 @@ from packuv.files import write_json
 from packuv.fit import KeyState
 from packuv.frames import Views
 from packuv.motion import MotionCache, MotionOptions, changed_between
+from packuv.seam import seam, tail
 from packuv.segment import Segment
 from packuv.solver import FitOptions
 from packuv.start import Points
@@ -34,7 +35,7 @@ from tasks.track import MOTION
 from tasks.workshop import Workshop
 
 VERSION = 1
-SEGMENT, FIGURES, STILLS = "segment.npz", "fit.json", "stills.npz"
+SEGMENT, FIGURES, STILLS, SEAM = "segment.npz", "fit.json", "stills.npz", "seam.json"
 SURE_VIEWS = 3
 """Cameras that must see a point for Gaussians to start there; two may agree by chance"""
 
@@ -105,18 +106,20 @@ def fit_next(
     points: Key,
     background: Key | None,
     previous: Key,
+    end: Key | None,
     step: tuple[int, int],
     pictures: PictureOptions,
     motion: MotionOptions,
     options: FitOptions,
 ) -> Key:
-    """Fit the keyframe at instant `step[1]` from the one at `step[0]`."""
+    """Fit the keyframe at instant `step[1]` from the one at `step[0]`, or from the last frame of its segment `end`."""
     options = _without(
         options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell", "background"
     )
     arguments = {
         "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
         "previous": workshop.path(previous),
+        "end": workshop.path(end) / SEGMENT if end else None,
         "background": _stills_path(workshop, background),
         "instant": step[1],
         "motion": motion,
@@ -125,7 +128,8 @@ def fit_next(
     reads = {**_reads(plan, pictures, options), "motion": motion, "step": step}
     inputs = {"groups": groups, "points": points, "previous": previous}
     inputs |= {"background": background} if background else {}
-    label = f"fit key {step[1]}"
+    inputs |= {"end": end} if end else {}
+    label = f"fit key {step[1]}{' again' if end else ''}"
     return workshop.make("key", VERSION, reads, inputs, "tasks.splat:build_next", arguments, label=label)
 
 
@@ -155,6 +159,33 @@ def fit_segment(
     inputs = {"groups": groups, "points": points, "motion": motion, "key": key}
     label = f"fit {span.start}-{span.stop - 1}"
     return workshop.make("segment", VERSION, reads, inputs, "tasks.splat:build_segment", arguments, label=label)
+
+
+def measure_seam(
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    points: Key,
+    key: Key,
+    segment: Key,
+    after: Key,
+    pictures: PictureOptions,
+) -> Key:
+    """Measure how much the border between a keyframe's segment and the keyframe `after` it shows: seam.json."""
+    arguments = {
+        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
+        "key": workshop.path(key),
+        "segment": workshop.path(segment) / SEGMENT,
+        "after": workshop.path(after),
+    }
+    reads = {"pictures": pictures, "cameras": plan.fitted, "first": plan.first}
+    inputs = {"groups": groups, "points": points, "key": key, "segment": segment, "after": after}
+    return workshop.make("seam", VERSION, reads, inputs, "tasks.splat:build_seam", arguments)
+
+
+def read_seam(workshop: Workshop, key: Key) -> float | None:
+    """Flicker across a border over that before it; None where nobody can tell."""
+    return json.loads((workshop.path(key) / SEAM).read_text())["ratio"]
 
 
 def read_losses(workshop: Workshop, segment: Key) -> list[float]:
@@ -205,6 +236,7 @@ def build_first(
 def build_next(
     footage: Footage,
     previous: Path,
+    end: Path | None,
     background: Path | None,
     instant: int,
     motion: MotionOptions,
@@ -214,6 +246,8 @@ def build_next(
 ) -> dict[str, Any]:
     """The job behind `fit_next`."""
     views, before = footage.open_views(), KeyState.load(previous)
+    if end:
+        before = tail(before, Segment.load(end))
     masks = _changes(views, before.instant, instant, motion)
     state = fit.fit_next(
         before,
@@ -252,6 +286,14 @@ def build_segment(
     hold_absent(segment).save(out / SEGMENT)
     write_json(out / FIGURES, {"frames": figures})
     return {"frames": len(segment), "gaussians": len(segment.key), "dynamic": int(segment.dynamic.sum())}
+
+
+def build_seam(footage: Footage, key: Path, segment: Path, after: Path, out: Path) -> dict[str, Any]:
+    """The job behind `measure_seam`."""
+    found = seam(KeyState.load(key), Segment.load(segment), KeyState.load(after), footage.open_views())
+    facts = {"ratio": found if math.isfinite(found) else None}
+    write_json(out / SEAM, facts)
+    return facts
 
 
 def build_cut(segment: Path, frames: int, out: Path) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Fits of a tiny scene made of Gaussians: a still cloud, and a ball that moves through it."""
 
 import dataclasses
+import math
 
 import av
 import numpy as np
@@ -13,7 +14,9 @@ from packuv.frames import LensCamera, Views
 from packuv.metrics import psnr
 from packuv.model import ATTRIBUTES
 from packuv.motion import MotionCache, MotionOptions, changed_between, measure_motion
+from packuv.quantize import OPACITY
 from packuv.raster import RasterOptions, render
+from packuv.seam import seam, tail
 from packuv.solver import FitOptions, Shot
 from packuv.start import StartOptions, round_gaussians
 
@@ -206,3 +209,52 @@ def test_view_dependence_that_a_scene_shows_is_kept(views):
     plain = [Shot(c, render(base, c, options=RasterOptions(0.1)).colour) for c in views.cameras]
     dull = dataclasses.replace(shiny, sh=np.concatenate([base.sh, np.zeros((len(base), 3, 3), np.float32)], axis=1))
     assert needed_degree(dull, plain, near=0.1, options=options) == 0
+
+
+# -- borders between segments ------------------------------------------------------------------------------------------
+
+BORDER = 3
+
+
+@pytest.fixture(scope="module")
+def segment(key, views, motion, tmp_path_factory):
+    scratch = tmp_path_factory.mktemp("scratch")
+    return fit_segment(key, views, range(BORDER), motion=motion, options=OPTIONS, scratch=scratch)[0]
+
+
+def following(previous, views, stills):
+    cameras = range(len(views.cameras))
+    masks = [changed_between(views, camera, previous.instant, BORDER, MOTION) for camera in cameras]
+    return fit_next(previous, views, BORDER, masks=masks, stills=stills, motion=MOTION, options=OPTIONS)
+
+
+def test_a_fit_that_goes_on_from_the_last_frame_shows_less_at_the_border(key, segment, views, stills):
+    apart, continued = following(key, views, stills), following(tail(key, segment), views, stills)
+    assert seam(key, segment, continued, views) < seam(key, segment, apart, views)
+
+
+def test_what_changes_everywhere_shows(key, segment, views):
+    after = tail(key, segment)
+    brighter = dataclasses.replace(after.gaussians, sh=after.gaussians.sh + np.float32(0.3))
+    shown = seam(key, segment, dataclasses.replace(after, gaussians=brighter), views)
+    assert shown > 1.5 * seam(key, segment, after, views)
+
+
+def test_the_tail_is_the_last_frame_without_its_empty_rows(key, segment):
+    last, state = segment.frame(BORDER - 1), tail(key, segment)
+    assert state.instant == BORDER - 1
+    assert len(state.gaussians) == int((last.attributes[:, OPACITY] > 1).sum()) < len(last)
+    again = key.quantizer.encode(state.gaussians)
+    assert {row.tobytes() for row in again.xyz} <= {row.tobytes() for row in last.xyz}
+
+
+def test_a_segment_of_one_frame_has_nothing_to_compare_with(key, segment, views):
+    single = dataclasses.replace(segment, xyz=segment.xyz[:0], attributes=segment.attributes[:0])
+    with pytest.raises(ValueError, match="which has one frame"):
+        seam(key, single, key, views)
+
+
+def test_instants_that_nobody_filmed_tell_nothing(key, segment, views):
+    frames = np.full_like(views.frames, -1)
+    blind = type(views)(views.reader.videos, frames, views.lenses)
+    assert math.isnan(seam(key, segment, key, blind))

@@ -139,9 +139,25 @@ def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
     shorter = {**SETTINGS["fit"], "frame_iterations": 3}
     found = made(run(request(capture, out, settings={**SETTINGS, "fit": shorter}))[0])
     assert {label for label in found if label.startswith("fit")} == {"fit 0-2", "fit 3-5"}
-    assert {label for label in found if not label.startswith("fit")} == {"encode", "verify", "evaluate"}
+    assert {label for label in found if not label.startswith("fit")} == {"seam", "encode", "verify", "evaluate"}
     assert redone(evaluate={"fitted_cameras": 2}) == {"evaluate"}
     assert redone() == set()  # back to what was there at first
+
+
+def seam_of(outcome: Outcome) -> float:
+    """Flicker at the scene's border over that elsewhere, for the camera that was held out."""
+    metrics = outcome.folder / "store" / artefacts(outcome)["evaluate"] / "metrics.json"
+    return json.loads(metrics.read_text())["seam"]
+
+
+def test_a_border_that_shows_is_fitted_again_from_the_frame_before_it(first, capture, tmp_path):
+    outcome, _ = first
+    shutil.copytree(outcome.folder / "store", tmp_path / "tiny" / "store")
+    settings = {**SETTINGS, "keyframes": {**SETTINGS["keyframes"], "seam": 1.01}}
+    mended, _ = run(request(capture, tmp_path, settings=settings))
+    fits = {label for label in made(mended) if label.startswith("fit")}
+    assert fits == {"fit key 3 again", "fit 3-5"}
+    assert seam_of(mended) < seam_of(outcome)
 
 
 def test_a_full_disk_is_refused_before_the_work(first, capture, tmp_path, monkeypatch):
