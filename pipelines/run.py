@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from pipelines.progress import TerminalProgress
 from pipelines.request import RunRequest, read_settings
 from pipelines.server import workflow_server
+from sync.capture import CaptureSettings
 
 if TYPE_CHECKING:
     from pipelines.process import Outcome
@@ -54,8 +55,10 @@ def run(request: RunRequest, progress: TerminalProgress, *, direct: bool) -> Out
         return process_directly(request, progress)
     with workflow_server(Path(request.out)) as server:
         progress.started("workflow engine")
-        from pipelines.sequence import run_flow  # takes seconds, in which the server starts
+        from pipelines.options import compose  # takes seconds, in which the server starts
+        from pipelines.sequence import run_flow
 
+        compose(request.preset, CaptureSettings(), request.settings)  # a misspelt setting need not wait for the server
         server.wait_ready()
         progress.ended("workflow engine")
         return run_flow(request, progress)
