@@ -30,7 +30,7 @@ SINGLE = {
     "encode": "write the scene file",
 }
 """Commands that run the stages up to the one they name"""
-BENCHMARKS = ("ablation", "codec", "motion", "raster", "stress_fit", "sync_index")
+BENCHMARKS = ("ablation", "codec", "motion", "raster", "sequence", "stress_fit", "sync_index")
 BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
 
