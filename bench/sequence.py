@@ -41,7 +41,7 @@ def gather(folder: Path) -> dict[str, Any]:
         "machine": platform.machine(),
         "seconds": {stage: round(sum(_of(run, stage, "seconds")), 1) for stage in parts},
         "peak_memory_bytes": max(value for stage in parts for value in _of(run, stage, "peak_memory_bytes")),
-        "scores": {name: metrics[name] for name in ("mean", "by_camera", "flicker", "seam") if name in metrics},
+        "scores": {name: metrics[name] for name in ("mean", "by_camera", "seam")},
         "psnr_db_over_time": _over_time(parts["evaluate"][0] / "metrics.arrow"),
         "frames": metrics["frames"],
         "bytes": metrics["bytes"],

@@ -382,7 +382,7 @@ def _read_poses_bounds(file: Path, names: Sequence[str] | None) -> list[_View]:
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise ValueError(
             f"poses_bounds.npy must hold a row of 17 finite numbers for each camera, but is {rows.shape}, "
-            f"{int(np.isnan(rows).sum())} of them not a number; export it again, or give another calibration"
+            f"{int((~np.isfinite(rows)).sum())} of them not finite; export it again, or give another calibration"
         )
     of_row = _names_of_rows(len(rows), names)
     return [_View((of_row[number],), _llff_camera(row)) for number, row in enumerate(rows)]
