@@ -12,7 +12,7 @@ import numpy as np
 
 from packuv.fit import DEAD_CODE, KeyState
 from packuv.frames import Views
-from packuv.quantize import OPACITY, Codes
+from packuv.quantize import OPACITY, Gaussians
 from packuv.raster import RasterOptions, Workspace, render
 from packuv.segment import Segment
 
@@ -26,12 +26,13 @@ def seam(key: KeyState, segment: Segment, after: KeyState, views: Views) -> floa
     if len(segment) < 2:
         raise ValueError("a seam is compared with the flicker inside the segment before it, which has one frame")
     last = segment.first + len(segment) - 1
-    shown = [segment.frame(len(segment) - 2), segment.frame(len(segment) - 1), key.quantizer.encode(after.gaussians)]
+    codes = [segment.frame(len(segment) - 2), segment.frame(len(segment) - 1), key.quantizer.encode(after.gaussians)]
+    shown = [key.quantizer.decode(part) for part in codes]
     workspace, inside, across = Workspace(), [], []
     for index in range(len(views.cameras)):
         before, middle, border = (
-            _error(key, codes, views, index, instant, workspace)
-            for codes, instant in zip(shown, (last - 1, last, last + 1), strict=True)
+            _error(gaussians, views, index, instant, key.bounds.near, workspace)
+            for gaussians, instant in zip(shown, (last - 1, last, last + 1), strict=True)
         )
         if before is not None and middle is not None and border is not None:
             inside.append(np.abs(middle - before).mean())
@@ -49,12 +50,11 @@ def tail(key: KeyState, segment: Segment) -> KeyState:
 
 
 def _error(
-    key: KeyState, codes: Codes, views: Views, index: int, instant: int, workspace: Workspace
+    gaussians: Gaussians, views: Views, index: int, instant: int, near: float, workspace: Workspace
 ) -> np.ndarray | None:
     """Render minus picture, float32 [3, H, W]; None where the camera has no picture."""
     picture = views.picture(index, instant)
     if picture is None:
         return None
-    options = RasterOptions(key.bounds.near)
-    drawn = render(key.quantizer.decode(codes), views.cameras[index], options=options, workspace=workspace)
+    drawn = render(gaussians, views.cameras[index], options=RasterOptions(near), workspace=workspace)
     return np.clip(drawn.colour, 0, 1) - picture
