@@ -2,6 +2,7 @@
 
     python -m bench.raster --out runs/raster.json                          # a made-up room
     python -m bench.raster --ply scene.ply --out runs/raster.json          # a trained scene
+    python -m bench.raster --device cuda --out runs/raster.json            # and the same iteration on a GPU
 
 Times are the least and the median of several repetitions, milliseconds. With one thread they are CPU time, which other
 processes disturb least; with more they are wall time. Compare rows of one run.
@@ -31,11 +32,23 @@ from numba import njit
 
 from packuv.adam import AdamState, adam_step
 from packuv.camera import PinholeCamera
+from packuv.device import choose_device
 from packuv.interchange import read_ply
+from packuv.labels import LabelOptions, count_hits
 from packuv.losses import PhotometricOptions, photometric_loss
 from packuv.quantize import Gaussians
-from packuv.raster import RasterOptions, Workspace, bins, blend, cpu, tile_shape
-from packuv.raster.cpu import Gradients, Rendering, backward, forward
+from packuv.raster import (
+    Gradients,
+    RasterOptions,
+    Rendering,
+    Workspace,
+    bins,
+    blend,
+    cpu,
+    gradients,
+    render,
+    tile_shape,
+)
 from packuv.raster.simd import fma, splat, sum_lanes
 
 STAGES = (
@@ -58,6 +71,8 @@ class BenchOptions:
     height: int = 360
     sh_degree: int = 3
     """Of the made-up room"""
+    views: int = 27
+    """Cameras of the labels"""
     repeats: int = 15
     """Repetitions of every measurement"""
     shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.1, 0.05)
@@ -136,11 +151,18 @@ def stage_times(clock: Clock) -> Iterator[dict[str, list[float]]]:
 class Iteration:
     """One camera's iteration of a fit, again and again."""
 
-    def __init__(self, gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions, clock: Clock) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        camera: PinholeCamera,
+        options: BenchOptions,
+        clock: Clock,
+        device: str = "cpu",
+    ) -> None:
         rng = np.random.default_rng(options.seed)
         self.gaussians, self.camera, self.clock = gaussians, camera, clock
         self.target = rng.random((3, camera.height, camera.width)).astype(np.float32)
-        self.work = Workspace()
+        self.work, self.raster = Workspace(), RasterOptions(near=0.05, device=device)
         self.parameters = [getattr(gaussians, f.name).copy() for f in fields(Gaussians)]
         self.states = [AdamState.zeros(array) for array in self.parameters]
         self.times: dict[str, list[float]] = {name: [] for name in ("forward", "loss", "backward", "adam")}
@@ -148,12 +170,12 @@ class Iteration:
     def run(self, tiles: np.ndarray | None = None, rows: np.ndarray | None = None) -> Rendering:
         """Render, compare, differentiate, step; the times go to `times`."""
         clock, times, target = self.clock, self.times, self.target
-        drawn = timed(clock, times["forward"], forward, self.gaussians, self.camera, options=RasterOptions(near=0.05),
+        drawn = timed(clock, times["forward"], render, self.gaussians, self.camera, options=self.raster,
                       workspace=self.work, tiles=tiles)  # fmt: skip
         loss = timed(
             clock, times["loss"], photometric_loss, drawn.colour, target, options=PhotometricOptions(), tiles=tiles
         )
-        found = timed(clock, times["backward"], backward, drawn, loss.gradient, rows=rows)
+        found = timed(clock, times["backward"], gradients, drawn, loss.gradient, rows=rows)
         visible = drawn.visible > 0
         timed(clock, times["adam"], self._step, found, visible if rows is None else visible & rows)
         return drawn
@@ -182,6 +204,20 @@ def measure_iteration(
         "pairs": drawn.pair_count, "evaluations": drawn.evaluation_count, "iteration": iteration.summary(),
         "stages": {name: summary(samples) for name, samples in per_repeat.items()},
     }  # fmt: skip
+
+
+def measure_device(gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions, device: str) -> dict[str, Any]:
+    """An iteration and the labels of a frame where `device` draws and counts, wall time, copies to and fro included."""
+    iteration = Iteration(gaussians, camera, options, time.perf_counter, device)
+    mask = np.random.default_rng(options.seed).random((camera.height, camera.width)) < 0.01
+    cameras, masks, labels = [camera] * options.views, [mask] * options.views, list[float]()
+    for _ in range(options.repeats + 1):
+        iteration.run()
+        timed(time.perf_counter, labels, count_hits, gaussians, cameras, masks, near=0.05, options=LabelOptions(),
+              device=device)  # fmt: skip
+    for samples in (*iteration.times.values(), labels):
+        del samples[0]  # compiles
+    return {"device": device, "iteration": iteration.summary(), "labels": summary(labels), "views": options.views}
 
 
 def measure_shares(gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions) -> list[dict[str, Any]]:
@@ -263,8 +299,9 @@ def throughput(measured: dict[str, Any], peak: float) -> dict[str, dict[str, flo
     return out
 
 
-def run(options: BenchOptions, ply: Path | None = None) -> dict[str, Any]:
-    """All measurements."""
+def run(options: BenchOptions, ply: Path | None = None, device: str = "cpu") -> dict[str, Any]:
+    """All measurements. Raises ValueError for a GPU that cannot be used."""
+    devices = sorted({"cpu", choose_device(device)})
     gaussians = read_ply(ply) if ply else room(options)
     camera = trained_camera(gaussians, options) if ply else room_camera(options)
     call_everything()
@@ -278,6 +315,7 @@ def run(options: BenchOptions, ply: Path | None = None) -> dict[str, Any]:
         "peak_gflops_per_core": round(peak, 1), "iterations": iterations,
         "throughput": [throughput(measured, peak) for measured in iterations],
         "active_tiles": measure_shares(gaussians, camera, options), "compiler": measure_compiler(),
+        "devices": [measure_device(gaussians, camera, options, name) for name in devices],
     }  # fmt: skip
 
 
@@ -296,6 +334,9 @@ def report(result: dict[str, Any]) -> Iterator[str]:
     yield f"active tiles: {', '.join(columns)} (ms, least)"
     for row in result["active_tiles"]:
         yield f"  {row['tiles']:6.1%} " + " ".join(f"{row[name]['min_ms']:8.2f}" for name in columns)
+    for row in result["devices"]:
+        columns = {**row["iteration"], f"labels in {row['views']} views": row["labels"]}
+        yield f"{row['device']}, wall: " + ", ".join(f"{name} {v['median_ms']:.2f}" for name, v in columns.items())
     yield f"first calls: cold {result['compiler']['cold']}, warm {result['compiler']['warm']}"
 
 
@@ -306,9 +347,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", default="640x360", help="of the picture, WxH")
     parser.add_argument("--count", type=int, default=BenchOptions.count, help="Gaussians of the made-up room")
     parser.add_argument("--repeats", type=int, default=BenchOptions.repeats)
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="measured beside the CPU")
     given = parser.parse_args(arguments)
     width, height = map(int, given.size.split("x"))
-    result = run(BenchOptions(count=given.count, width=width, height=height, repeats=given.repeats), given.ply)
+    result = run(
+        BenchOptions(count=given.count, width=width, height=height, repeats=given.repeats), given.ply, given.device
+    )
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps(result, indent=1) + "\n")
     print("\n".join(report(result)))

@@ -275,11 +275,11 @@ def _surface(shell: Shell | None, points: Points | None, options: FitOptions) ->
 def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, options: FitOptions) -> int:
     """The lowest SH degree whose pictures are nearly as good as those of all bands: view dependence that a scene does
     not show is not carried. Nothing is fitted again, so a band that helps is kept rather than lost."""
-    full, workspace = options.sh_degree, Workspace()
+    full, workspace, raster = options.sh_degree, Workspace(), RasterOptions(near, device=options.device)
 
     def loss(degree: int) -> float:
         cut = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
-        drawn = (render(cut, s.camera, options=RasterOptions(near), workspace=workspace).colour for s in shots)
+        drawn = (render(cut, s.camera, options=raster, workspace=workspace).colour for s in shots)
         values = [photometric_loss(picture, shot.target, options=options.photometric).value
                   for picture, shot in zip(drawn, shots, strict=True)]  # fmt: skip
         return float(np.mean(values))
@@ -346,7 +346,8 @@ def _labels(
 ) -> np.ndarray:  # bool [N]
     """Gaussians that a motion mask touches in some camera (paper, algorithm 4)."""
     drawn = quantizer.decode(quantizer.encode(gaussians))
-    return dynamic_labels(drawn, views.cameras, masks, near=bounds.near, options=options.labels)
+    return dynamic_labels(drawn, views.cameras, masks, near=bounds.near, options=options.labels,
+                          device=options.device)  # fmt: skip
 
 
 def _hull_gaussians(

@@ -75,14 +75,16 @@ def dynamic_labels(
     near: float,
     options: LabelOptions,
     depths: Sequence[np.ndarray | None] | None = None,
+    device: str = "cpu",
 ) -> np.ndarray:  # bool [N]
     """Which Gaussians overlap the motion masks, bool [H, W] per camera at the camera's size.
 
     A camera without a mask (None) has no say, nor has one nearer than `near` to the Gaussian, or one where the
     Gaussian is hidden by `depths` (float [H, W] along the camera's z axis; 0 or NaN where nothing is). A mask that
     is empty does have a say: it saw no motion. Takes O(N * cameras * rows of the ellipse), whatever its width.
+    `device` "cpu" or "cuda" tells who counts.
     """
-    hits, views = count_hits(gaussians, cameras, masks, near=near, options=options, depths=depths)
+    hits, views = count_hits(gaussians, cameras, masks, near=near, options=options, depths=depths, device=device)
     return np.asarray((hits >= options.min_cameras) & (hits >= options.least_share * views))
 
 
@@ -94,6 +96,7 @@ def count_hits(
     near: float,
     options: LabelOptions,
     depths: Sequence[np.ndarray | None] | None = None,
+    device: str = "cpu",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Per Gaussian, the cameras whose mask it overlaps and the cameras that see it, int32 [N] each.
 
@@ -104,15 +107,18 @@ def count_hits(
     covariance, visible = _world_covariance(gaussians), _visible(gaussians)
     rule = np.array([options.sigmas, options.radius_limit_px, options.least_overlap, 1 + options.depth_tolerance,
                      options.centres_only], dtype=np.float64)  # fmt: skip
+    voters = (
+        (_view(camera, near, options.low_pass_px2), summed_area(_check_picture(mask, camera, "mask")),
+         np.zeros((0, 0), np.float32) if depth is None else _check_picture(depth, camera, "depth").astype(np.float32))
+        for camera, mask, depth in zip(cameras, masks, depths or [None] * len(cameras), strict=True) if mask is not None
+    )  # fmt: skip
+    if device != "cpu":
+        from packuv.labels_cuda import count_on_gpu  # CUDA is not looked for where nobody wants it
+
+        return count_on_gpu(gaussians.means, covariance, visible, list(voters), rule)
     hits, views = np.zeros(len(gaussians), dtype=np.int32), np.zeros(len(gaussians), dtype=np.int32)
-    for camera, mask, depth in zip(cameras, masks, depths or [None] * len(cameras), strict=True):
-        if mask is None:
-            continue
-        _check_picture(mask, camera, "mask")
-        table = summed_area(mask)
-        depth = np.zeros((0, 0), np.float32) if depth is None else _check_picture(depth, camera, "depth")
-        view, depth = _view(camera, near, options.low_pass_px2), np.ascontiguousarray(depth, dtype=np.float32)
-        _vote(gaussians.means, covariance, visible, view, table, depth, rule, hits, views)
+    for view, table, depth in voters:
+        _vote(gaussians.means, covariance, visible, view, table, np.ascontiguousarray(depth), rule, hits, views)
     return hits, views
 
 
@@ -299,27 +305,33 @@ def _pixel(x, y, table):
     return table[row + 1, column + 1] - table[row, column + 1] - table[row + 1, column] + table[row, column] > 0
 
 
-@njit(parallel=True, **_OPTIONS)
-def _vote(means, covariance, visible, view, table, depth, rule, hits, views):
-    """Add one camera's opinion: `views` [N] grows where it sees a Gaussian, `hits` [N] where its mask is hit as well.
+@njit(**_OPTIONS)
+def opinion(means, covariance, view, table, depth, rule, i):
+    """One camera of one Gaussian: whether it sees it, and whether its mask is hit as well.
 
     `rule`, float64 [5]: sigmas, radius limit, least overlap, depth slack, and whether only centres count.
     """
-    count, width, height = len(means), view[16], view[17]
+    x, y, z, xx, xy, yy = _project(means, covariance, view, i)
+    # Algorithm 4, step 3; the comparisons also refuse what is not a number.
+    if not (z > 0 and xx * yy - xy * xy > 1e-7 and abs(x) < 1e9 and abs(y) < 1e9):
+        return False, False
+    if _is_hidden(x, y, z, depth, rule[3]):
+        return False, False
+    centred = 0 <= x < view[16] and 0 <= y < view[17]
+    hit = centred and _pixel(x, y, table) if rule[4] else _is_hit(x, y, xx, xy, yy, rule, table)
+    return centred or hit, hit
+
+
+@njit(parallel=True, **_OPTIONS)
+def _vote(means, covariance, visible, view, table, depth, rule, hits, views):
+    """Add one camera's opinion: `views` [N] grows where it sees a Gaussian, `hits` [N] where its mask is hit too."""
+    count = len(means)
     for chunk in prange(CHUNKS):
         for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
-            if not visible[i]:
-                continue
-            x, y, z, xx, xy, yy = _project(means, covariance, view, i)
-            # Algorithm 4, step 3; the comparisons also refuse what is not a number.
-            if not (z > 0 and xx * yy - xy * xy > 1e-7 and abs(x) < 1e9 and abs(y) < 1e9):
-                continue
-            if _is_hidden(x, y, z, depth, rule[3]):
-                continue
-            centred = 0 <= x < width and 0 <= y < height
-            hit = centred and _pixel(x, y, table) if rule[4] else _is_hit(x, y, xx, xy, yy, rule, table)
-            hits[i] += hit
-            views[i] += centred or hit
+            if visible[i]:
+                seen, hit = opinion(means, covariance, view, table, depth, rule, i)
+                views[i] += seen
+                hits[i] += hit
 
 
 @njit(parallel=True, **_OPTIONS)

@@ -89,6 +89,8 @@ class FitOptions:
     settle: float = 0.003
     """A frame stops when a pass over the cameras improves the loss by less than this share"""
     seed: int = 0
+    device: str = "cpu"
+    """Who renders and labels: "cpu", or "cuda" (see `packuv.device`); the rest is done by the CPU either way"""
     background: BackgroundOptions = field(default_factory=BackgroundOptions)
     shell: ShellOptions = field(default_factory=ShellOptions)
     start: StartOptions = field(default_factory=StartOptions)
@@ -222,8 +224,8 @@ class Solver:
             self._order = list(self._rng.permutation(len(shots)))
         shot = shots[self._order.pop()]
         options, drawn = self._options, self._decoded()
-        rendering = render(drawn, shot.camera, options=RasterOptions(self._near()), tiles=shot.tiles,
-                           workspace=self._workspace)  # fmt: skip
+        rendering = render(drawn, shot.camera, options=RasterOptions(self._near(), device=options.device),
+                           tiles=shot.tiles, workspace=self._workspace)  # fmt: skip
         behind = self._behind(shot.target) if opaque else None
         picture = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
         # What is not known is taken for right as it is.

@@ -317,7 +317,6 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--cameras", type=_names, default=None, metavar="a,b", help="cameras (those held out, or three)"
     )
-    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
     _json(command)
 
 

@@ -131,17 +131,18 @@ def _stores(folder: Path) -> list[Path]:
 
 def render(arguments: argparse.Namespace) -> int:
     """`packuv render`: <frame>.png for each frame, numbered as in the scene."""
+    from packuv.device import choose_device
     from packuv.scene import open_scene
     from tasks.evaluate import Artist, frames_of, write_picture
 
-    _check_device(arguments.device)
+    device = choose_device(arguments.device)
     with open_scene(arguments.scene) as scene, shown(arguments, "render") as progress:
         camera = _camera(arguments.camera, scene.header.cameras)
         if arguments.size:
             camera = camera.scaled(*arguments.size)
         frames = frames_of(scene, *arguments.frames)
         arguments.output.mkdir(parents=True, exist_ok=True)
-        artist = Artist(scene)
+        artist = Artist(scene, device)
         for done, frame in enumerate(frames, start=1):
             write_picture(arguments.output / f"{frame:06d}.png", artist.draw(scene.gaussians(frame), camera))
             progress(done, len(frames))
@@ -166,16 +167,10 @@ def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
         raise ValueError(f"{name} is no camera in JSON: {error}") from None
 
 
-def _check_device(device: str) -> None:
-    if device == "cuda":
-        raise ValueError("this version renders on the CPU only; use --device auto or cpu")
-
-
 def evaluate(arguments: argparse.Namespace) -> int:
     """`packuv eval`: PSNR and SSIM of every frame against what cameras filmed."""
     from tasks.evaluate import EvaluateOptions, evaluate_scene
 
-    _check_device(arguments.device)
     with shown(arguments, "evaluate") as progress:
         facts = evaluate_scene(
             arguments.scene, arguments.capture, arguments.cameras, EvaluateOptions(), progress=progress

@@ -35,7 +35,7 @@ def _examine() -> Iterator[tuple[str, tuple[bool, str], bool]]:
         yield name, _module(name), True
     yield "pycolmap", _module("pycolmap"), False
     yield "gpu", _gpu(), False
-    yield "gsplat", _module("gsplat"), False
+    yield "fit on gpu", _fit_on_gpu(), False
 
 
 def _memory() -> tuple[bool, str]:
@@ -54,6 +54,15 @@ def _module(name: str) -> tuple[bool, str]:
     except Exception as error:
         return False, f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error) else ''}"
     return True, str(getattr(module, "__version__", "there"))
+
+
+def _fit_on_gpu() -> tuple[bool, str]:
+    try:
+        from packuv.device import obstacle  # needs numba, which may be what is missing
+    except ImportError as error:
+        return False, str(error)
+    problem = obstacle()
+    return problem is None, problem or "gsplat draws what the CPU draws"
 
 
 def _gpu() -> tuple[bool, str]:

@@ -7,11 +7,12 @@ import shlex
 import shutil
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from packuv.device import choose_device
 from pipelines.chain import Submit
 from pipelines.options import compose
 from pipelines.progress import Event, TerminalProgress
@@ -90,6 +91,7 @@ def process(request: RunRequest, progress: TerminalProgress, submit: Submit) -> 
     capture = find_capture(Path(request.capture))
     options = compose(request.preset, capture.settings, request.settings, seed=request.seed, quality=request.quality)
     plan = plan_of(request, capture)
+    options = replace(options, fit=replace(options.fit, device=plan.device))
     folder = Path(request.out).absolute() / capture.name
     folder.mkdir(parents=True, exist_ok=True)
     jobs = Jobs(threads=max(1, _cores() // jobs_at_once(request)))
@@ -108,11 +110,9 @@ def process(request: RunRequest, progress: TerminalProgress, submit: Submit) -> 
 
 def plan_of(request: RunRequest, capture: Capture) -> Plan:
     """What the request means for this capture; raises ValueError for cameras that it lacks or a missing GPU."""
-    if request.device == "cuda":
-        raise ValueError("this version fits on the CPU only; use --device auto or cpu")
     first, stop = request.frames
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
-    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, "cpu")
+    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, choose_device(request.device))
 
 
 def jobs_at_once(request: RunRequest) -> int:

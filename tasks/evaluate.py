@@ -203,8 +203,8 @@ def write_pictures(folder: Path, scene: Scene, views: Views, chosen: Sequence[tu
 class Artist:
     """Draws Gaussians of a scene as its fit did."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._options = RasterOptions(near=float(scene.header.extra["near"]))
+    def __init__(self, scene: Scene, device: str = "cpu") -> None:
+        self._options = RasterOptions(near=float(scene.header.extra["near"]), device=device)
         self._workspace = Workspace()
 
     def draw(self, gaussians: Gaussians, camera: PinholeCamera) -> np.ndarray:

@@ -332,7 +332,6 @@ def _reads(plan: Plan, pictures: PictureOptions, options: FitOptions) -> dict[st
         "pictures": pictures,
         "cameras": plan.fitted,
         "first": plan.first,
-        "device": plan.device,
     }
 
 

@@ -1,7 +1,7 @@
 """CPU and GPU Gaussian rasterizers behind one pair of functions.
 
-`render` draws Gaussians with one camera, `gradients` carries derivatives of the picture back to them. Where the
-Gaussians live decides who does the work: numpy arrays go to the CPU rasterizer, CUDA tensors to gsplat.
+`render` draws Gaussians with one camera, `gradients` carries derivatives of the picture back to them. The options'
+device decides who does the work, our kernels or gsplat; arrays are numpy's either way.
 """
 
 from __future__ import annotations
@@ -30,28 +30,31 @@ def render(
     weights: bool = False,
     workspace: Workspace | None = None,
 ) -> Any:
-    """Picture of N Gaussians: `cpu.Rendering`, or `gsplat.TensorRendering` with the same fields on a GPU.
+    """Picture of N Gaussians: `cpu.Rendering`, or `gsplat.GpuRendering` with the same fields.
 
     `tiles`, bool as `tile_shape(camera)`, names the tiles to draw; the rest shows background. `weights` asks for
-    the blending weight of each Gaussian. `workspace` holds memory between calls, CPU only. Raises ValueError if the
-    Gaussians are tensors that are not on a GPU, or if shapes do not fit.
+    the blending weight of each Gaussian. `workspace` holds memory between calls, CPU only. Raises ValueError if
+    shapes do not fit.
     """
-    if isinstance(gaussians.means, np.ndarray):
+    if options.device == "cpu":
         return cpu.forward(gaussians, camera, options=options, sh_degree=sh_degree, background=background, tiles=tiles,
                            weights=weights, workspace=workspace)  # fmt: skip
-    if gaussians.means.device.type != "cuda":
-        raise ValueError("Gaussians on the CPU must be numpy arrays, but are tensors; take tensor.detach().numpy()")
     return _gsplat().forward(gaussians, camera, options=options, sh_degree=sh_degree, background=background,
                              tiles=tiles, weights=weights)  # fmt: skip
 
 
 def gradients(
-    rendering: Any, d_colour: Any, d_depth: Any = None, d_alpha: Any = None, *, rows: Any = None
+    rendering: Any,
+    d_colour: np.ndarray,
+    d_depth: np.ndarray | None = None,
+    d_alpha: np.ndarray | None = None,
+    *,
+    rows: np.ndarray | None = None,
 ) -> Gradients:
     """Gradients of a scalar by the Gaussians, from its derivatives by the pictures of `rendering`.
 
     d_colour [3, H, W]; d_depth and d_alpha [H, W], None for zero; `rows`, bool [N], the Gaussians that may change, the
-    others get zeros. Arrays or tensors, as the rendering holds.
+    others get zeros.
     """
     if isinstance(rendering, Rendering):
         return cpu.backward(rendering, d_colour, d_depth, d_alpha, rows=rows)

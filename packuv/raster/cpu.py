@@ -38,6 +38,8 @@ class RasterOptions:
     it is a share of the rig's size, since cameras may sit in the wall they film."""
     low_pass_px2: float = 0.3
     """Added to both variances of every ellipse in the picture, pixels squared, as in 3D Gaussian Splatting."""
+    device: str = "cpu"
+    """cpu, or the name of a torch device that gsplat draws on"""
 
     def __post_init__(self) -> None:
         if not (self.near > 0 and self.low_pass_px2 > 0):

@@ -1,9 +1,9 @@
 """The CUDA rasterizer: gsplat 1.5 behind the functions and conventions of the CPU one.
 
-Fields of `Gaussians` and of all results are CUDA tensors here. gsplat is an optional dependency, imported when first
-used. It differs in three things: versions differ in the cap on alpha (0.999 or 0.99, ours 0.99), sums on the GPU
-have no fixed order, and tiles cannot be left out, so a mask of tiles is laid over the finished picture and saves no
-time.
+Arrays come and go as numpy's, so that callers need not know where they are drawn. gsplat is an optional dependency,
+imported when first used. It differs in three things: versions differ in the cap on alpha (0.999 or 0.99, ours 0.99),
+sums on the GPU have no fixed order, and tiles cannot be left out, so a mask of tiles is laid over the finished picture
+and saves no time.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ _FAR = 1e10
 
 
 @dataclass(frozen=True)
-class TensorRendering:
-    """A picture of Gaussians on a GPU; the fields mean what they mean in `cpu.Rendering`."""
+class GpuRendering:
+    """A picture of Gaussians drawn on a GPU; the fields mean what they mean in `cpu.Rendering`."""
 
-    colour: Tensor
+    colour: np.ndarray
     """float32 [3, H, W], background included"""
-    depth: Tensor
+    depth: np.ndarray
     """float32 [H, W]: sum of weight times z"""
-    alpha: Tensor
+    alpha: np.ndarray
     """float32 [H, W]"""
-    visible: Tensor
+    visible: np.ndarray
     """int32 [N]: tiles that the Gaussian's bounding box touches"""
-    weights: Tensor | None
+    weights: np.ndarray | None
     """float32 [N], if asked for: sum over pixels of transmittance * alpha"""
     invalid_count: int
     """Gaussians skipped because an attribute is not finite or absurd, or the quaternion is zero"""
-    _leaves: tuple[Tensor, ...] = field(repr=False)
-    _means2d: Tensor = field(repr=False)
+    _pictures: tuple[Tensor, ...] = field(repr=False)
+    _inputs: tuple[Tensor, ...] = field(repr=False)
 
 
 def forward(
@@ -53,46 +53,53 @@ def forward(
     background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     tiles: np.ndarray | None = None,
     weights: bool = False,
-) -> TensorRendering:
-    """Render Gaussians whose fields are float32 CUDA tensors; arguments as in `cpu.forward`.
+) -> GpuRendering:
+    """Render on the torch device `options.device`; arguments as in `cpu.forward`.
 
     Raises ImportError, saying what to install, where gsplat is missing.
     """
-    leaves = tuple(tensor.detach().requires_grad_() for tensor in _fields(gaussians))
+    device = torch.device(options.device)
+    leaves = tuple(torch.tensor(array, device=device, requires_grad=True) for array in _fields(gaussians))
     scene, valid = _sanitized(*leaves)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    mask = _pixel_mask(tiles, camera, device)
     with torch.enable_grad():
         values, alpha, meta = _rasterize(scene, scene["sh"], camera, options, degree, "RGB+D")
-        colour, depth, alpha = _composed(values, alpha, _pixel_mask(tiles, camera, alpha), background)
-    sums = _weights(scene, camera, options, tiles) if weights else None
-    visible = meta["tiles_per_gauss"].reshape(-1).to(torch.int32)
-    return TensorRendering(colour, depth, alpha, visible, sums, int((~valid).sum()), leaves, meta["means2d"])
+        pictures = _composed(values, alpha, mask, background)
+    sums = _array(_weights(scene, camera, options, mask)) if weights else None
+    visible = _array(meta["tiles_per_gauss"].reshape(-1).to(torch.int32))
+    invalid, inputs = int((~valid).sum()), (*leaves, meta["means2d"])
+    shown = [_array(picture) for picture in pictures]
+    return GpuRendering(shown[0], shown[1], shown[2], visible, sums, invalid, pictures, inputs)
 
 
 def backward(
-    rendering: TensorRendering,
-    d_colour: Tensor,
-    d_depth: Tensor | None = None,
-    d_alpha: Tensor | None = None,
+    rendering: GpuRendering,
+    d_colour: np.ndarray,
+    d_depth: np.ndarray | None = None,
+    d_alpha: np.ndarray | None = None,
     *,
-    rows: Tensor | None = None,
+    rows: np.ndarray | None = None,
 ) -> Gradients:
-    """Gradients as in `cpu.backward`, as tensors. The rendering can be used once: its graph is freed."""
-    pairs = [(rendering.colour, d_colour), (rendering.depth, d_depth), (rendering.alpha, d_alpha)]
-    given = [(picture, gradient) for picture, gradient in pairs if gradient is not None]
-    inputs = (*rendering._leaves, rendering._means2d)
-    pictures, upstream = [picture for picture, _ in given], [gradient for _, gradient in given]
-    found = torch.autograd.grad(pictures, inputs, upstream, allow_unused=True)
-    whole = [torch.zeros_like(a) if g is None else g for g, a in zip(found, inputs, strict=True)]
+    """Gradients as in `cpu.backward`. A rendering serves once: its graph is freed."""
+    device = rendering._pictures[0].device
+    pairs = zip(rendering._pictures, (d_colour, d_depth, d_alpha), strict=True)
+    given = [(picture, torch.as_tensor(slope, device=device)) for picture, slope in pairs if slope is not None]
+    pictures, slopes = [picture for picture, _ in given], [slope for _, slope in given]
+    found = torch.autograd.grad(pictures, rendering._inputs, slopes, allow_unused=True)
+    whole = [torch.zeros_like(a) if g is None else g for g, a in zip(found, rendering._inputs, strict=True)]
     whole[5] = whole[5].reshape(-1, 2)  # [1, N, 2] of one camera
     finite = torch.stack([g.reshape(len(g), -1).isfinite().all(1) for g in whole]).all(0)
-    keep = finite if rows is None else finite & rows
-    kept = [torch.where(keep.reshape(-1, *[1] * (g.ndim - 1)), g, 0) for g in whole]
-    arrays: list[Any] = kept
-    return Gradients(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], arrays[5], int((~finite).sum()))
+    keep = finite if rows is None else finite & torch.as_tensor(rows, device=device)
+    kept = [_array(torch.where(keep.reshape(-1, *[1] * (g.ndim - 1)), g, 0)) for g in whole]
+    return Gradients(kept[0], kept[1], kept[2], kept[3], kept[4], kept[5], int((~finite).sum()))
 
 
-def _fields(gaussians: Any) -> tuple[Tensor, ...]:
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy()
+
+
+def _fields(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     return (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits, gaussians.sh)
 
 
@@ -146,21 +153,20 @@ def _composed(values: Tensor, alpha: Tensor, mask: Tensor, background: Any) -> t
     return colour, values[..., 3], alpha
 
 
-def _pixel_mask(tiles: np.ndarray | None, camera: PinholeCamera, like: Tensor) -> Tensor:
+def _pixel_mask(tiles: np.ndarray | None, camera: PinholeCamera, device: torch.device) -> Tensor:
     """1 in active tiles, 0 elsewhere, [H, W]."""
     active = checked_tiles(tiles, camera).astype(np.float32)
     mask = active.repeat(TILE, axis=0).repeat(TILE, axis=1)[: camera.height, : camera.width]
-    return torch.as_tensor(np.ascontiguousarray(mask), device=like.device)
+    return torch.as_tensor(np.ascontiguousarray(mask), device=device)
 
 
-def _weights(scene: dict[str, Tensor], camera: PinholeCamera, options: RasterOptions, tiles: np.ndarray | None
-             ) -> Tensor:  # fmt: skip
+def _weights(scene: dict[str, Tensor], camera: PinholeCamera, options: RasterOptions, mask: Tensor) -> Tensor:
     """Blending weight per Gaussian: the derivative of a picture's sum by a colour that all Gaussians share."""
     frozen = {name: tensor.detach() for name, tensor in scene.items()}
     ones = torch.ones((len(frozen["means"]), 1), device=frozen["means"].device, requires_grad=True)
     with torch.enable_grad():
-        values, alpha, _ = _rasterize(frozen, ones, camera, options, None, "RGB")
-        total = (values[..., 0] * _pixel_mask(tiles, camera, alpha)).sum()
+        values, _, _ = _rasterize(frozen, ones, camera, options, None, "RGB")
+        total = (values[..., 0] * mask).sum()
     return torch.autograd.grad(total, ones)[0][:, 0]
 
 

@@ -1,0 +1,60 @@
+"""Labels on a GPU: one kernel pass over Gaussians times views, with the CPU's own functions for each pair."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numba.cuda
+import numpy as np
+
+from packuv.labels import opinion
+
+cuda: Any = numba.cuda
+_BLOCK = 32, 8
+
+
+def count_on_gpu(
+    means: np.ndarray,
+    covariance: np.ndarray,
+    visible: np.ndarray,
+    voters: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    rule: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Hits and views, int32 [N] each, as `labels.count_hits` counts them; a voter is a view, its table and depths."""
+    hits, seen = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
+    if not len(means) or not voters:
+        return hits, seen
+    views, tables, depths = (list(part) for part in zip(*voters, strict=True))
+    grid = -(-len(means) // _BLOCK[0]), -(-len(voters) // _BLOCK[1])
+    _vote_all[grid, _BLOCK](means, covariance, visible, np.stack(views), _stacked(tables), _sizes(tables),
+                            _stacked(depths), _sizes(depths), rule, hits, seen)  # fmt: skip
+    return hits, seen
+
+
+def _stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Pictures of different sizes in one array, each in its upper left corner."""
+    height, width = _sizes(pictures).max(axis=0)
+    whole = np.zeros((len(pictures), max(1, height), max(1, width)), pictures[0].dtype)
+    for place, picture in zip(whole, pictures, strict=True):
+        place[: picture.shape[0], : picture.shape[1]] = picture
+    return whole
+
+
+def _sizes(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    return np.array([picture.shape for picture in pictures])
+
+
+@cuda.jit
+def _vote_all(means, covariance, visible, views, tables, table_sizes, depths, depth_sizes, rule, hits, seen):
+    """A thread for each Gaussian and view."""
+    i, c = cuda.grid(2)
+    if i >= means.shape[0] or c >= views.shape[0] or not visible[i]:
+        return
+    table = tables[c, : table_sizes[c, 0], : table_sizes[c, 1]]
+    depth = depths[c, : depth_sizes[c, 0], : depth_sizes[c, 1]]
+    saw, hit = opinion(means, covariance, views[c], table, depth, rule, i)
+    if saw:
+        cuda.atomic.add(seen, i, 1)
+    if hit:
+        cuda.atomic.add(hits, i, 1)
