@@ -46,7 +46,7 @@ from packuv.start import (
     round_gaussians,
 )
 
-VERSION = 4
+VERSION = 5
 """Raised with every change that alters what a fit returns"""
 
 DEAD_CODE = 1
@@ -229,9 +229,9 @@ def _fit_frame(
     loss, count = solver.settle(shots, options.frame_iterations)
     changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
     tiles = float(np.mean([shot.tiles.mean() for shot in shots if shot.tiles is not None]))
-    figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count, "loss": loss,
+    figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count,
                "dynamic": int(changed.sum()), "tiles": tiles, "guarded": solver.guarded}  # fmt: skip
-    return changed, figures
+    return changed, figures if loss is None else {**figures, "loss": loss}
 
 
 def _before_background(

@@ -28,6 +28,10 @@ _VOID = 16 / 255
 """A pixel whose channels are all below may show nothing: decoded black is not quite black"""
 
 
+_ROUND = 24
+"""Iterations, at least, before a frame asks how it fares: few cameras are passed over several times"""
+
+
 class Ticks:
     """Counts work done and tells whoever asked."""
 
@@ -48,7 +52,7 @@ class FitOptions:
     """Of the first keyframe, one camera each"""
     key_iterations: int = 500
     """Of each later keyframe"""
-    frame_iterations: int = 60
+    frame_iterations: int = 240
     """Of each frame inside a segment, at most"""
     coarse_share: float = 0.1
     """Share of the first keyframe's iterations on pictures of half the size"""
@@ -86,8 +90,8 @@ class FitOptions:
     """Gaussians born inside the hull of what changed since the last keyframe"""
     births_share: float = 0.05
     """Of the moving rows, how many empty ones may come alive in one pass"""
-    settle: float = 0.003
-    """A frame stops when a pass over the cameras improves the loss by less than this share"""
+    settle: float = 0.02
+    """A frame stops when the last two rounds of `_ROUND` iterations each lowered the loss by less than this share"""
     seed: int = 0
     device: str = "cpu"
     """Who renders and labels: "cpu", or "cuda" (see `packuv.device`); the rest is done by the CPU either way"""
@@ -193,38 +197,53 @@ class Solver:
         losses = []
         self._order = []
         for _ in range(count):
-            losses.append(self._iterate(shots, progress=self.done / of, opaque=self._options.random_background))
+            shot, opaque = shots[self._next(shots)], self._options.random_background
+            losses.append(self._iterate(shot, self._near(), progress=self.done / of, opaque=opaque))
             if dense and self.done % self._options.density.every == 0 and self.done < of * self._options.density.until:
-                self._round(of)
+                self._change_density(of)
             if ticks:
                 ticks.advance()
         return float(np.mean(losses[-len(shots) :])) if losses else 0.0
 
-    def settle(self, shots: Sequence[Shot], limit: int) -> tuple[float, int]:
-        """Passes over the cameras until the loss settles or `limit` iterations; returns the last mean loss and count.
+    def settle(self, shots: Sequence[Shot], limit: int) -> tuple[float | None, int]:
+        """Rounds over the cameras until they gain little or `limit` iterations; returns the mean loss and the count.
 
-        Empty rows are used for what the pictures still lack after the first pass.
+        A gain compares each picture with itself, in iterations that draw everything; the loss is None if none did.
+        Empty rows are used for what the pictures lack after each of the first rounds.
         """
-        best, done, mean = np.inf, 0, np.inf
-        while done < limit:
-            count = min(len(shots), limit - done)
-            losses = [self._iterate(shots, progress=0.0, scale=self._options.frame_rate_scale) for _ in range(count)]
-            done, mean = done + count, float(np.mean(losses))
-            if done < limit * self._options.density.until:
+        losses, gains, done = np.full(len(shots), np.nan), list[float](), 0
+        while done < limit and not (gains and np.mean(gains[-2:]) < self._options.settle):
+            count = min(max(len(shots), _ROUND), limit - done)
+            fresh, done = self._round(shots, count), done + count
+            both = np.isfinite(losses) & np.isfinite(fresh)
+            if both.any():
+                gains.append(1 - fresh[both].sum() / losses[both].sum())
+            losses = np.where(np.isfinite(fresh), fresh, losses)
+            if done <= limit * self._options.density.until:
                 relocate(self.model, self.gradient.mean, self.rows, bounds=self.bounds,
                          options=self._options.density, share=self._options.births_share, rng=self._rng)  # fmt: skip
                 self._start_afresh()
-            elif mean > best * (1 - self._options.settle):
-                break
-            best = min(best, mean)
-        return mean, done
+        return (float(np.nanmean(losses)) if np.isfinite(losses).any() else None), done
 
-    def _iterate(self, shots: Sequence[Shot], *, progress: float, scale: float = 1.0, opaque: bool = False) -> float:
+    def _round(self, shots: Sequence[Shot], count: int) -> np.ndarray:
+        """`count` iterations of a frame; the last loss of each shot that was drawn whole, NaN for others, [shots]."""
+        losses = np.full(len(shots), np.nan)
+        for _ in range(count):
+            index, near = self._next(shots), self._near()
+            loss = self._iterate(shots[index], near, progress=0.0, scale=self._options.frame_rate_scale)
+            if near == self.bounds.near:
+                losses[index] = loss
+        return losses
+
+    def _next(self, shots: Sequence[Shot]) -> int:
+        """The next shot: each once, in an order at random, then again."""
         if not self._order:
             self._order = list(self._rng.permutation(len(shots)))
-        shot = shots[self._order.pop()]
+        return self._order.pop()
+
+    def _iterate(self, shot: Shot, near: float, *, progress: float, scale: float = 1.0, opaque: bool = False) -> float:
         options, drawn = self._options, self._decoded()
-        rendering = render(drawn, shot.camera, options=RasterOptions(self._near(), device=options.device),
+        rendering = render(drawn, shot.camera, options=RasterOptions(near, device=options.device),
                            tiles=shot.tiles, workspace=self._workspace)  # fmt: skip
         behind = self._behind(shot.target) if opaque else None
         picture = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
@@ -298,7 +317,7 @@ class Solver:
         """Rows that pruning leaves, bool [N]."""
         return prune(self.model, self.gradient, bounds=self.bounds, options=self._options.density, uv=self._options.uv)
 
-    def _round(self, of: int) -> None:
+    def _change_density(self, of: int) -> None:
         """Prune, then grow towards the cap."""
         options = self._options.density
         kept = ~self.rows | self.worth_keeping()

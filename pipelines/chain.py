@@ -52,24 +52,30 @@ class Chain:
     def fit(self, spans: Sequence[range]) -> Iterator[tuple[Key, Key]]:
         """A keyframe and its segment for each span in order, and for each piece that a promoted keyframe cuts off.
 
-        The next keyframe is submitted before the segment, because the chain is the longest way through the work.
+        Side by side, keyframes are fitted one from another, and the next one is submitted before the segment, because
+        the chain is the longest way through the work. One at a time, what comes after the anchor goes on from the end
+        of the segment before it, which costs less and shows no border.
         """
         instants = [span.start for span in spans]
         anchor, steps = fitting_order(count_pictures(self.workshop, self.plan, self.groups, instants))
         keys, segments = {anchor: self._first(instants[anchor]).result()}, {}
         last = anchor
         for index, start in steps:
+            if index > start and not self.plan.side_by_side:
+                continue
             following = self._next(keys[start], (instants[start], instants[index]))
             segments[last] = self._segment(keys[last], spans[last])
             keys[index], last = following.result(), index
         segments[last] = self._segment(keys[last], spans[last])
-        pieces = ((keys[i], segments[i], span) for i, span in enumerate(spans))
         before: Piece | None = None
-        for piece in (part for whole in pieces for part in self._promote(*whole)):
-            if before and self._shows(before, piece):
-                piece = self._continue(before, piece[2])
-            before = piece
-            yield piece[0], piece[1].result()
+        for index, span in enumerate(spans):
+            own = (keys[index], segments[index], span) if index in keys else None
+            if before and (own is None or self._shows(before, own)):
+                own = self._continue(before, span)
+            assert own is not None, "the first span has a keyframe, for the chain reaches back to it"
+            for piece in self._promote(*own):
+                before = piece
+                yield piece[0], piece[1].result()
 
     def _promote(self, key: Key, segment: Future, span: range) -> Iterator[Piece]:
         """The segment, cut where the fit of a frame shows that a keyframe is missing."""
@@ -78,9 +84,9 @@ class Chain:
             yield key, segment, span
             return
         head, rest = range(span.start, span.start + frame), range(span.start + frame, span.stop)
-        after = self._next(key, (span.start, rest.start)).result()
-        yield key, self.submit(cut_segment, self.workshop, segment.result(), frame), head
-        yield from self._promote(after, self._segment(after, rest), rest)
+        cut = self.submit(cut_segment, self.workshop, segment.result(), frame)
+        yield key, cut, head
+        yield from self._promote(*self._continue((key, cut, head), rest))
 
     def _shows(self, before: Piece, piece: Piece) -> bool:
         """Whether the border between two segments flickers more than the first one does by itself."""
@@ -93,7 +99,7 @@ class Chain:
         return ratio is not None and ratio > limit
 
     def _continue(self, before: Piece, span: range) -> Piece:
-        """A segment fitted again, from the end of the one before it."""
+        """A segment that goes on from the end of the one before it."""
         key, segment, earlier = before
         again = self._next(key, (earlier.stop - 1, span.start), segment.result()).result()
         return again, self._segment(again, span), span

@@ -38,20 +38,27 @@ class SequenceOptions:
 _PRESETS: Mapping[str, Mapping[str, Any]] = {
     "draft": {
         "pictures": {"max_width": 640},
-        "fit": {"iterations": 1200, "key_iterations": 300, "frame_iterations": 48},
+        "fit": {"iterations": 1200, "key_iterations": 300, "frame_iterations": 144, "settle": 0.05},
     },
     "standard": {
         "pictures": {"max_width": 1280},
         "fit": {
             "iterations": 5000,
             "key_iterations": 1500,
-            "frame_iterations": 150,
+            "frame_iterations": 480,
+            "settle": 0.02,
             "start": {"count": 30_000},
             "density": {"cap": 80_000},
         },
     },
     "high": {
-        "fit": {"iterations": 15000, "key_iterations": 4000, "frame_iterations": 400, "sh_degree": 3},
+        "fit": {
+            "iterations": 15000,
+            "key_iterations": 4000,
+            "frame_iterations": 1200,
+            "settle": 0.005,
+            "sh_degree": 3,
+        },
     },
 }
 assert tuple(_PRESETS) == PRESETS

@@ -112,7 +112,8 @@ def plan_of(request: RunRequest, capture: Capture) -> Plan:
     """What the request means for this capture; raises ValueError for cameras that it lacks or a missing GPU."""
     first, stop = request.frames
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
-    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, choose_device(request.device))
+    device, side_by_side = choose_device(request.device), jobs_at_once(request) > 1
+    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, device, side_by_side)
 
 
 def jobs_at_once(request: RunRequest) -> int:

@@ -23,6 +23,8 @@ class Plan:
     """The instant after the last one; None: to the end"""
     device: str
     """cpu or cuda"""
+    side_by_side: bool
+    """Fit segments at the same time, none knowing how the one before it ends; otherwise each goes on from there"""
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.held_out if name not in self.videos]:

@@ -129,7 +129,7 @@ def fit_next(
     inputs = {"groups": groups, "points": points, "previous": previous}
     inputs |= {"background": background} if background else {}
     inputs |= {"end": end} if end else {}
-    label = f"fit key {step[1]}{' again' if end else ''}"
+    label = f"fit key {step[1]}{f' after {step[0]}' if end else ''}"
     return workshop.make("key", VERSION, reads, inputs, "tasks.splat:build_next", arguments, label=label)
 
 

@@ -138,8 +138,8 @@ def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
 
     shorter = {**SETTINGS["fit"], "frame_iterations": 3}
     found = made(run(request(capture, out, settings={**SETTINGS, "fit": shorter}))[0])
-    assert {label for label in found if label.startswith("fit")} == {"fit 0-2", "fit 3-5"}
-    assert {label for label in found if not label.startswith("fit")} == {"seam", "encode", "verify", "evaluate"}
+    assert {label for label in found if label.startswith("fit")} == {"fit 0-2", "fit key 3 after 2", "fit 3-5"}
+    assert {label for label in found if not label.startswith("fit")} == {"encode", "verify", "evaluate"}
     assert redone(evaluate={"fitted_cameras": 2}) == {"evaluate"}
     assert redone() == set()  # back to what was there at first
 
@@ -150,14 +150,21 @@ def seam_of(outcome: Outcome) -> float:
     return json.loads(metrics.read_text())["seam"]
 
 
-def test_a_border_that_shows_is_fitted_again_from_the_frame_before_it(first, capture, tmp_path):
+def test_side_by_side_a_border_that_shows_is_fitted_again_from_the_frame_before_it(first, capture, tmp_path):
     outcome, _ = first
     shutil.copytree(outcome.folder / "store", tmp_path / "tiny" / "store")
-    settings = {**SETTINGS, "keyframes": {**SETTINGS["keyframes"], "seam": 1.01}}
-    mended, _ = run(request(capture, tmp_path, settings=settings))
-    fits = {label for label in made(mended) if label.startswith("fit")}
-    assert fits == {"fit key 3 again", "fit 3-5"}
-    assert seam_of(mended) < seam_of(outcome)
+
+    def fitted(limit: float) -> tuple[set[str], Outcome]:
+        settings = {**SETTINGS, "keyframes": {**SETTINGS["keyframes"], "seam": limit}}
+        found, _ = run(request(capture, tmp_path, settings=settings, jobs=2))
+        return {label for label in made(found) if label.startswith("fit")}, found
+
+    fits, apart = fitted(0)
+    assert fits == {"fit key 3", "fit 3-5"}  # what comes first is the same, one at a time or side by side
+    fits, mended = fitted(1.01)
+    assert fits == set()  # what goes on from the frame before is what one at a time makes
+    assert artefacts(mended)["fit 3-5"] == artefacts(outcome)["fit 3-5"] != artefacts(apart)["fit 3-5"]
+    assert seam_of(mended) < seam_of(apart)
 
 
 def test_a_full_disk_is_refused_before_the_work(first, capture, tmp_path, monkeypatch):
@@ -269,8 +276,8 @@ def test_a_run_that_stops_leaves_the_finished_segments_as_a_scene_that_plays(fir
             return submit
 
         with pytest.raises(KeyboardInterrupt):
-            process(asked, TerminalProgress(io.StringIO()), stop_at("fit_segment", 2))
-        assert not partial.exists()  # the first segment was still under way
+            process(asked, TerminalProgress(io.StringIO()), stop_at("fit_segment", 1))
+        assert not partial.exists()
         with pytest.raises(KeyboardInterrupt):
             process(asked, TerminalProgress(io.StringIO()), stop_at("encode", 1))
     with open_scene(partial) as scene:
