@@ -31,6 +31,9 @@ _VOID = 16 / 255
 _ROUND = 24
 """Iterations, at least, before a frame asks how it fares: few cameras are passed over several times"""
 
+_GREY = 1 / 255
+"""A loss below one grey level is as good as none: what it gains does not count in full"""
+
 
 class Ticks:
     """Counts work done and tells whoever asked."""
@@ -217,7 +220,7 @@ class Solver:
             fresh, done = self._round(shots, count), done + count
             both = np.isfinite(losses) & np.isfinite(fresh)
             if both.any():
-                gains.append(1 - fresh[both].sum() / losses[both].sum())
+                gains.append((losses - fresh)[both].mean() / max(losses[both].mean(), _GREY))
             losses = np.where(np.isfinite(fresh), fresh, losses)
             if done <= limit * self._options.density.until:
                 relocate(self.model, self.gradient.mean, self.rows, bounds=self.bounds,
