@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from packuv.scene import open_scene
 from pipelines.process import Outcome, process_directly
 from pipelines.progress import TerminalProgress
 from pipelines.request import PRESETS, RunRequest, read_settings
@@ -36,8 +37,10 @@ ROWS: Mapping[str, Sequence[str]] = {
     "w/o labeling": ("fit.labels.sigmas=1e6", "fit.labels.radius_limit_px=1e6", "fit.labels.least_overlap=0",
                      "fit.labels.least_share=0"),
     # A map so fine that hardly two Gaussians share a texel.
-    "w/o UV optimisation": ("fit.uv.rows=4096", "fit.uv.columns=4096"),
+    "w/o atlas": ("fit.uv.rows=4096", "fit.uv.columns=4096"),
     "w/o LPO": ("fit.low_precision=false",),
+    # The file holds what was fitted to the bit, so only the size differs.
+    "w/o codec": (),
     "w/o shell": ("fit.shell.enabled=false",),
     "w/o background": ("fit.background.iteration_share=0",),
     "w/o random background": ("fit.random_background=false",),
@@ -84,9 +87,18 @@ def run_row(name: str, options: AblationOptions, costs: dict[str, float]) -> dic
     figures = outcome.figures
     return {
         "row": name, "settings": list(ROWS[name]), "psnr_db": figures["psnr_db"], "ssim": figures["ssim"],
-        "mb_per_30_frames": figures["mb_per_30_frames"], "fit_seconds": _fit_seconds(outcome, costs),
+        "mb_per_30_frames": _plain_mb(outcome) if name == "w/o codec" else figures["mb_per_30_frames"],
+        "fit_seconds": _fit_seconds(outcome, costs),
         "frames": figures["frames"], "scored_cameras": figures["scored_cameras"], "held_out": figures["held_out"],
     }  # fmt: skip
+
+
+def _plain_mb(outcome: Outcome) -> float:
+    """Size of 30 frames whose codes are stored as they are."""
+    assert outcome.scene is not None
+    with open_scene(outcome.scene) as scene:
+        frames = [scene.codes(frame) for frame in range(len(scene))]
+    return 30 * sum(codes.xyz.nbytes + codes.attributes.nbytes for codes in frames) / len(frames) / 1e6
 
 
 def _fit_seconds(outcome: Outcome, costs: Mapping[str, float]) -> float | None:

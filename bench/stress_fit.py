@@ -3,8 +3,9 @@
     python -m bench.stress_fit --out runs/stress_fit.json --frames 1000
 
 Everything is tiny (96x64 pictures of a few hundred Gaussians), so that a thousand frames take minutes. The sequence is
-a ball that moves through a still cloud, fitted as the pipeline does: keyframes from one to the next, then the frames
-of each segment; PSNR, number of Gaussians and memory are noted along the way.
+a ball that moves through a still cloud, fitted as the pipeline does: each segment from a keyframe that goes on from the
+end of the segment before, or from the keyframe before (--side-by-side); PSNR, number of Gaussians and memory are noted
+along the way.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from packuv.model import ATTRIBUTES, Model
 from packuv.motion import MotionCache, MotionOptions, changed_between, measure_motion
 from packuv.quantize import Gaussians
 from packuv.raster import RasterOptions, render
+from packuv.seam import tail
 from packuv.solver import FitOptions, Shot, Solver
 from packuv.start import Bounds, StartOptions, find_bounds, round_gaussians
 
@@ -51,6 +53,8 @@ class StressOptions:
     segment: int = 25
     """Frames from one keyframe to the next"""
     cameras: int = 6
+    side_by_side: bool = False
+    """Fit keyframes from one another"""
     iterations: int = 40
     """Of each case"""
     seconds: float = np.inf
@@ -225,22 +229,23 @@ def fit_sequence(
 ) -> dict[str, list[Any]]:
     """Fit all segments; per frame the PSNR of the codes on the judges' cameras, dB; per segment count and memory.
 
-    Keyframes follow each other and each segment starts at its own, as in the pipeline.
+    Each segment starts at a keyframe of its own, as in the pipeline.
     """
     started = time.monotonic()
     stills = find_background(views, options.fit.background)
-    key = fit_first(views, 0, points=None, stills=stills, motion=MOTION, options=options.fit)
+    key = end = fit_first(views, 0, points=None, stills=stills, motion=MOTION, options=options.fit)
     found: dict[str, list[Any]] = {"psnr_db": [], "gaussians": [], "changed": [], "memory_mb": []}
     starts = range(0, len(views), options.segment)
     for number, start in enumerate(starts):
         if time.monotonic() - started > options.seconds:
             break
         if number:
-            key = _next_key(key, views, start, stills, options.fit)
+            key = _next_key(end, views, start, stills, options.fit)
         folder = scratch / f"segment{start}"
         folder.mkdir()
         instants = range(start, min(start + options.segment, len(views)))
         segment, _ = fit_segment(key, views, instants, motion=motion, options=options.fit, scratch=folder)
+        end = key if options.side_by_side else tail(key, segment)
         for index, instant in enumerate(instants):
             shown = key.quantizer.decode(segment.frame(index))
             found["psnr_db"].append(_score(shown, instant, judges, key.bounds))
@@ -286,7 +291,8 @@ def run_sequence(options: StressOptions) -> dict[str, Any]:
         found = fit_sequence(views, motion, folder, options, judges=[unseen])
     values = found["psnr_db"]
     return {
-        "frames": len(values), "segment": options.segment, "fit_seconds": round(time.monotonic() - started, 1),
+        "frames": len(values), "segment": options.segment, "side_by_side": options.side_by_side,
+        "fit_seconds": round(time.monotonic() - started, 1),
         "unseen_psnr_db": {"mean": round(float(np.mean(values)), 3), "least": round(min(values), 3),
                            "first_50": round(float(np.mean(values[:50])), 3),
                            "last_50": round(float(np.mean(values[-50:])), 3), "drift": round(drift_db(values), 3)},
@@ -314,12 +320,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=StressOptions.frames)
     parser.add_argument("--segment", type=int, default=StressOptions.segment)
     parser.add_argument("--seconds", type=float, default=StressOptions.seconds, help="begin no segment after this time")
+    parser.add_argument("--side-by-side", action="store_true", help="fit keyframes from one another")
     given = parser.parse_args(arguments)
-    options = StressOptions(frames=given.frames, segment=given.segment, seconds=given.seconds)
-    command = (f"python -m bench.stress_fit --out {given.out} --frames {given.frames} --segment {given.segment}"
-               f" --seconds {given.seconds}")  # fmt: skip
+    options = StressOptions(given.frames, given.segment, side_by_side=given.side_by_side, seconds=given.seconds)
     sequence = run_sequence(options)
-    result = {"command": command, "load": os.getloadavg()[0], "cases": run_cases(options), "sequence": sequence}
+    result = {
+        "options": vars(given) | {"out": given.out.name},
+        "load": os.getloadavg()[0],
+        "cases": run_cases(options),
+        "sequence": sequence,
+    }
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps(result, indent=1) + "\n")
     print("\n".join(report(result)))

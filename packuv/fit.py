@@ -150,7 +150,7 @@ def fit_next(
     `masks` tell, per camera of `views`, what differs between the two instants, bool [H, W] (None: unknown, the whole
     picture may). Gaussians that touch no mask keep every code. What stood before the background and has gone is
     dropped, and new Gaussians are born in the hull of what stands there now; `stills` may be empty, then nothing is
-    known to have gone.
+    known to have gone. What exceeds the cap makes room: of the Gaussians that may change, those that show least.
     """
     started = time.monotonic()
     bounds, quantizer = previous.bounds, previous.quantizer
@@ -158,14 +158,15 @@ def fit_next(
     model = Model(previous.gaussians)
     solver = Solver(model, bounds, options, rng)
     solver.fix(quantizer)
-    if not any(mask is None or mask.any() for mask in masks):
-        return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, 0.0, solver))
     shots = _shots(views, instant, masks)
+    if not shots:
+        return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, 0.0, solver))
     before, after = (_before_background(views, i, stills, motion) for i in (previous.instant, instant))
     gone = _inside(model.gaussians, views, before, bounds, options)
     gone &= ~_inside(model.gaussians, views, after, bounds, options)
     solver.keep(~gone)
     solver.free(_labels(model.gaussians, quantizer, views, masks, bounds, options))
+    solver.make_room(shots)
     seen = [mask if alone is None else alone for alone, mask in zip(after, masks, strict=True)]
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = _tiled(shots, masks, solver, views)

@@ -188,6 +188,17 @@ class Solver:
         self.rows = np.concatenate([self.rows, np.ones(len(born), bool)])
         self._start_afresh()
 
+    def make_room(self, shots: Sequence[Shot]) -> None:
+        """Drop what exceeds the cap: of the rows that may change, those that show least in the pictures."""
+        excess = len(self.model) - self._options.density.cap
+        if excess <= 0:
+            return
+        drawn, raster = self._decoded(), RasterOptions(self.bounds.near, device=self._options.device)
+        shown = [render(drawn, shot.camera, options=raster, weights=True).weights for shot in shots]
+        rows = np.flatnonzero(self.rows)
+        least = rows[np.argsort(np.sum(shown, axis=0)[rows], kind="stable")[:excess]]
+        self.keep(~np.isin(np.arange(len(self.model)), least))
+
     def keep(self, rows: np.ndarray) -> None:
         self.model.keep(rows)
         self.rows = self.rows[rows]

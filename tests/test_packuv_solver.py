@@ -1,10 +1,13 @@
-"""When a frame has had enough iterations."""
+"""When a frame has had enough iterations, and which Gaussians make room."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
+from packuv.density import DensityOptions
 from packuv.losses import PhotometricOptions, photometric_loss
 from packuv.model import Model
 from packuv.raster import render
@@ -23,7 +26,7 @@ def shots(shift: float) -> list[Shot]:
     return [Shot(view, render(truth, view, options=OPTIONS).colour.clip(0, 1)) for view in VIEWS]
 
 
-def solver(**changes: float) -> Solver:
+def solver(**changes: Any) -> Solver:
     options = FitOptions(random_background=False, **changes)
     return Solver(Model(scene(60, degree=0)), Bounds(np.zeros(3), 2.0, OPTIONS.near), options, np.random.default_rng(0))
 
@@ -56,3 +59,18 @@ def test_slower_gains_are_waited_for_if_asked():
 def test_the_limit_holds_and_no_loss_is_made_up():
     assert solver(near_jitter=0.0).settle(shots(0.15), 30)[1] == 30
     assert solver(near_jitter=1.0, near_reach=1.6).settle(shots(0.15), 30) == (None, 30)
+
+
+def test_what_shows_least_makes_room_and_what_is_frozen_stays():
+    tried = solver(density=DensityOptions(cap=50))
+    rows = np.arange(60) % 3 != 0
+    tried.free(rows)
+    pictures = [render(tried.model.gaussians, view, options=OPTIONS, weights=True) for view in VIEWS]
+    shown = sum(picture.weights for picture in pictures)
+    before = tried.model.gaussians.means.copy()
+    tried.make_room(shots(0.0))
+    stays = ~rows | (shown > np.sort(shown[rows])[9])
+    assert np.array_equal(tried.model.gaussians.means, before[stays])
+    assert len(tried.rows) == len(tried.model) == 50
+    tried.make_room(shots(0.0))
+    assert len(tried.model) == 50

@@ -121,11 +121,13 @@ def _first(views):
     return fit_first(views, 0, points=None, stills=stills, motion=MOTION, options=OPTIONS.fit)
 
 
-def test_twenty_frames_in_two_segments_do_not_drift(sequence, tmp_path):
+@pytest.mark.parametrize("side_by_side", [False, True])
+def test_twenty_frames_in_two_segments_do_not_drift(sequence, tmp_path, side_by_side):
     """One camera is cut out for seven frames across the border of the segments."""
     views, motion = sequence
     unseen = dataclasses.replace(ring_cameras(CAMERAS, turn=0.5)[0], name=UNSEEN)
-    found = fit_sequence(views, motion, tmp_path, OPTIONS, judges=[unseen])
+    options = dataclasses.replace(OPTIONS, side_by_side=side_by_side)
+    found = fit_sequence(views, motion, tmp_path, options, judges=[unseen])
     values = np.array(found["psnr_db"])
     assert len(values) == FRAMES
     # An average of ten frames; the ball alone moves the figure by some tenths. Measured 0.1 dB.
