@@ -38,7 +38,7 @@ class SequenceOptions:
 _PRESETS: Mapping[str, Mapping[str, Any]] = {
     "draft": {
         "pictures": {"max_width": 640},
-        "fit": {"iterations": 1200, "key_iterations": 300, "frame_iterations": 144, "settle": 0.05},
+        "fit": {"iterations": 900, "key_iterations": 200, "frame_iterations": 144, "settle": 0.1},
     },
     "standard": {
         "pictures": {"max_width": 1280},
