@@ -115,7 +115,7 @@ def count_hits(
     if device != "cpu":
         from packuv.labels_cuda import count_on_gpu  # CUDA is not looked for where nobody wants it
 
-        return count_on_gpu(gaussians.means, covariance, visible, list(voters), rule)
+        return count_on_gpu(_opinion, gaussians.means, covariance, visible, list(voters), rule)
     hits, views = np.zeros(len(gaussians), dtype=np.int32), np.zeros(len(gaussians), dtype=np.int32)
     for view, table, depth in voters:
         _vote(gaussians.means, covariance, visible, view, table, np.ascontiguousarray(depth), rule, hits, views)
@@ -306,7 +306,7 @@ def _pixel(x, y, table):
 
 
 @njit(**_OPTIONS)
-def opinion(means, covariance, view, table, depth, rule, i):
+def _opinion(means, covariance, view, table, depth, rule, i):
     """One camera of one Gaussian: whether it sees it, and whether its mask is hit as well.
 
     `rule`, float64 [5]: sigmas, radius limit, least overlap, depth slack, and whether only centres count.
@@ -329,7 +329,7 @@ def _vote(means, covariance, visible, view, table, depth, rule, hits, views):
     for chunk in prange(CHUNKS):
         for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
             if visible[i]:
-                seen, hit = opinion(means, covariance, view, table, depth, rule, i)
+                seen, hit = _opinion(means, covariance, view, table, depth, rule, i)
                 views[i] += seen
                 hits[i] += hit
 

@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numba.cuda
 import numpy as np
-
-from packuv.labels import opinion
 
 cuda: Any = numba.cuda
 _BLOCK = 32, 8
 
 
 def count_on_gpu(
+    opinion: Callable[..., tuple[bool, bool]],
     means: np.ndarray,
     covariance: np.ndarray,
     visible: np.ndarray,
     voters: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
     rule: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hits and views, int32 [N] each, as `labels.count_hits` counts them; a voter is a view, its table and depths."""
+    """Hits and views, int32 [N] each, as `labels.count_hits` counts them.
+
+    `opinion` judges one Gaussian in one view; a voter is a view, its table and depths.
+    """
     hits, seen = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
     if not len(means) or not voters:
         return hits, seen
     views, tables, depths = (list(part) for part in zip(*voters, strict=True))
     grid = -(-len(means) // _BLOCK[0]), -(-len(voters) // _BLOCK[1])
-    _vote_all[grid, _BLOCK](means, covariance, visible, np.stack(views), _stacked(tables), _sizes(tables),
-                            _stacked(depths), _sizes(depths), rule, hits, seen)  # fmt: skip
+    _kernel(opinion)[grid, _BLOCK](means, covariance, visible, np.stack(views), _stacked(tables), _sizes(tables),
+                                   _stacked(depths), _sizes(depths), rule, hits, seen)  # fmt: skip
     return hits, seen
 
 
@@ -45,16 +48,21 @@ def _sizes(pictures: Sequence[np.ndarray]) -> np.ndarray:
     return np.array([picture.shape for picture in pictures])
 
 
-@cuda.jit
-def _vote_all(means, covariance, visible, views, tables, table_sizes, depths, depth_sizes, rule, hits, seen):
+@cache
+def _kernel(opinion: Callable[..., tuple[bool, bool]]) -> Any:
     """A thread for each Gaussian and view."""
-    i, c = cuda.grid(2)
-    if i >= means.shape[0] or c >= views.shape[0] or not visible[i]:
-        return
-    table = tables[c, : table_sizes[c, 0], : table_sizes[c, 1]]
-    depth = depths[c, : depth_sizes[c, 0], : depth_sizes[c, 1]]
-    saw, hit = opinion(means, covariance, views[c], table, depth, rule, i)
-    if saw:
-        cuda.atomic.add(seen, i, 1)
-    if hit:
-        cuda.atomic.add(hits, i, 1)
+
+    @cuda.jit
+    def vote_all(means, covariance, visible, views, tables, table_sizes, depths, depth_sizes, rule, hits, seen):
+        i, c = cuda.grid(2)
+        if i >= means.shape[0] or c >= views.shape[0] or not visible[i]:
+            return
+        table = tables[c, : table_sizes[c, 0], : table_sizes[c, 1]]
+        depth = depths[c, : depth_sizes[c, 0], : depth_sizes[c, 1]]
+        saw, hit = opinion(means, covariance, views[c], table, depth, rule, i)
+        if saw:
+            cuda.atomic.add(seen, i, 1)
+        if hit:
+            cuda.atomic.add(hits, i, 1)
+
+    return vote_all
