@@ -107,9 +107,10 @@ def count_hits(
     covariance, visible = _world_covariance(gaussians), _visible(gaussians)
     rule = np.array([options.sigmas, options.radius_limit_px, options.least_overlap, 1 + options.depth_tolerance,
                      options.centres_only], dtype=np.float64)  # fmt: skip
+    nowhere = np.zeros((0, 0), np.float32)
     voters = (
         (_view(camera, near, options.low_pass_px2), summed_area(_check_picture(mask, camera, "mask")),
-         np.zeros((0, 0), np.float32) if depth is None else _check_picture(depth, camera, "depth").astype(np.float32))
+         nowhere if depth is None else np.ascontiguousarray(_check_picture(depth, camera, "depth"), np.float32))
         for camera, mask, depth in zip(cameras, masks, depths or [None] * len(cameras), strict=True) if mask is not None
     )  # fmt: skip
     if device != "cpu":
@@ -118,7 +119,7 @@ def count_hits(
         return count_on_gpu(_opinion, gaussians.means, covariance, visible, list(voters), rule)
     hits, views = np.zeros(len(gaussians), dtype=np.int32), np.zeros(len(gaussians), dtype=np.int32)
     for view, table, depth in voters:
-        _vote(gaussians.means, covariance, visible, view, table, np.ascontiguousarray(depth), rule, hits, views)
+        _vote(gaussians.means, covariance, visible, view, table, depth, rule, hits, views)
     return hits, views
 
 

@@ -27,7 +27,6 @@ Progress = Callable[[int, int], None]
 _VOID = 16 / 255
 """A pixel whose channels are all below may show nothing: decoded black is not quite black"""
 
-
 _ROUND = 24
 """Iterations, at least, before a frame asks how it fares: few cameras are passed over several times"""
 
@@ -94,7 +93,7 @@ class FitOptions:
     births_share: float = 0.05
     """Of the moving rows, how many empty ones may come alive in one pass"""
     settle: float = 0.02
-    """A frame stops when the last two rounds of `_ROUND` iterations each lowered the loss by less than this share"""
+    """A frame stops when its last two rounds lowered the loss by less than this share, on average"""
     seed: int = 0
     device: str = "cpu"
     """Who renders and labels: "cpu", or "cuda" (see `packuv.device`); the rest is done by the CPU either way"""
@@ -194,10 +193,11 @@ class Solver:
         if excess <= 0:
             return
         drawn, raster = self._decoded(), RasterOptions(self.bounds.near, device=self._options.device)
-        shown = [render(drawn, shot.camera, options=raster, weights=True).weights for shot in shots]
-        rows = np.flatnonzero(self.rows)
-        least = rows[np.argsort(np.sum(shown, axis=0)[rows], kind="stable")[:excess]]
-        self.keep(~np.isin(np.arange(len(self.model)), least))
+        shown = [render(drawn, shot.camera, options=raster, weights=True, workspace=self._workspace).weights
+                 for shot in shots]  # fmt: skip
+        rows, stays = np.flatnonzero(self.rows), np.ones(len(self.model), bool)
+        stays[rows[np.argsort(np.sum(shown, axis=0)[rows], kind="stable")[:excess]]] = False
+        self.keep(stays)
 
     def keep(self, rows: np.ndarray) -> None:
         self.model.keep(rows)
