@@ -21,8 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from packuv.scene import open_scene
+from pipelines.commands.progress import TerminalProgress
+from pipelines.events import Journal
 from pipelines.process import Outcome, process_directly
-from pipelines.progress import TerminalProgress
 from pipelines.request import PRESETS, RunRequest, read_settings
 
 COSTS = "costs.json"
@@ -80,7 +81,7 @@ def run_row(name: str, options: AblationOptions, costs: dict[str, float]) -> dic
         capture=str(options.capture), out=str(options.work), preset=options.preset, settings=settings,
         frames=options.frames, hold_out=options.hold_out, seed=options.seed,
     )  # fmt: skip
-    outcome = process_directly(request, TerminalProgress(sys.stderr))
+    outcome = process_directly(request, Journal(TerminalProgress(sys.stderr)))
     for event in outcome.events:
         if event.key and event.outcome == "made":
             costs[str(event.key)] = event.seconds

@@ -30,15 +30,16 @@ import av
 import numpy as np
 
 from bench.made_up import SequenceOptions, find_gaussians, make_sequence
-from packuv.encoder import TOLERANCES, Quality
-from packuv.header import DYNAMIC, KEY
-from packuv.matroska import Encoder, Track
-from packuv.quantize import OPACITY, Codes, Quantizer
+from packuv.gaussians.codes import OPACITY, Codes, Quantizer
+from packuv.gaussians.segment import Segment
+from packuv.gaussians.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
 from packuv.scene import EncodeOptions, Scene, SceneHeader, open_scene, write_scene
-from packuv.segment import Segment
-from packuv.stream import channel_names, key_rows
-from packuv.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
-from tasks.evaluate import Artist, EvaluateOptions, evaluate_scene, spread
+from packuv.scene.encoder import TOLERANCES, Quality
+from packuv.scene.header import DYNAMIC, KEY
+from packuv.scene.matroska import Encoder, Track
+from packuv.scene.stream import channel_names, key_rows
+from packuv.score import Artist, spread
+from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, ROTATION, Quantizer, attribute_values
+from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.segment import Segment
+from packuv.gaussians.uvmap import UvOptions, assign_slots
 from packuv.interchange import read_ply
-from packuv.quantize import OPACITY, OPACITY_RANGE, ROTATION, Gaussians, Quantizer, attribute_values
-from packuv.segment import Segment
-from packuv.uvmap import UvOptions, assign_slots
 
 DATA = Path(os.environ.get("PACKUV_DATA", Path(__file__).parents[1] / "../shared/data"))
 

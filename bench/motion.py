@@ -24,7 +24,7 @@ import av
 import cv2
 import numpy as np
 
-from packuv.motion import FlowPreset, MotionOptions, grown, measure_step, optical_flow
+from packuv.motion.step import FlowPreset, MotionOptions, grown, measure_step, optical_flow
 
 
 @dataclass(frozen=True)

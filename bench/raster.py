@@ -30,13 +30,14 @@ import numba
 import numpy as np
 from numba import njit
 
-from packuv.adam import AdamState, adam_step
 from packuv.camera import PinholeCamera
-from packuv.device import choose_device
+from packuv.fit.adam import AdamState, adam_step
+from packuv.fit.device import choose_device
+from packuv.fit.labels import LabelOptions, count_hits
+from packuv.fit.losses import PhotometricOptions, photometric_loss
+from packuv.gaussians.floats import Gaussians
 from packuv.interchange import read_ply
-from packuv.labels import LabelOptions, count_hits
-from packuv.losses import PhotometricOptions, photometric_loss
-from packuv.quantize import Gaussians
+from packuv.kernels.simd import fma, splat, sum_lanes
 from packuv.raster import (
     Gradients,
     RasterOptions,
@@ -49,7 +50,6 @@ from packuv.raster import (
     render,
     tile_shape,
 )
-from packuv.raster.simd import fma, splat, sum_lanes
 
 STAGES = (
     (cpu, "project"), (bins, "drawn"), (bins, "sort_by_depth"), (bins, "running_sum"), (bins, "find_tiles"),

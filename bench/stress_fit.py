@@ -23,19 +23,25 @@ from typing import Any
 import av
 import numpy as np
 
-from packuv.background import Still, find_background
 from packuv.camera import PinholeCamera
-from packuv.density import DensityOptions
-from packuv.fit import KeyState, choose_quantizer, fit_first, fit_next, fit_segment
-from packuv.frames import LensCamera, Views
+from packuv.fit.density import DensityOptions
+from packuv.fit.frames import fit_segment
+from packuv.fit.keyframe import KeyState, choose_quantizer, fit_first, fit_next
+from packuv.fit.model import Model
+from packuv.fit.options import FitOptions
+from packuv.fit.seam import tail
+from packuv.fit.shots import Shot
+from packuv.fit.solver import Solver
+from packuv.fit.start.bounds import Bounds, find_bounds
+from packuv.fit.start.first import StartOptions, round_gaussians
+from packuv.footage.lens import LensCamera
+from packuv.footage.views import Views
+from packuv.gaussians.floats import ATTRIBUTES, Gaussians
 from packuv.metrics import psnr
-from packuv.model import ATTRIBUTES, Model
-from packuv.motion import MotionCache, MotionOptions, changed_between, measure_motion
-from packuv.quantize import Gaussians
+from packuv.motion.background import Still, find_background
+from packuv.motion.cache import MotionCache, measure_motion
+from packuv.motion.step import MotionOptions, changed_between
 from packuv.raster import RasterOptions, render
-from packuv.seam import tail
-from packuv.solver import FitOptions, Shot, Solver
-from packuv.start import Bounds, StartOptions, find_bounds, round_gaussians
 
 WIDTH, HEIGHT = 96, 64
 CACHE_BYTES = 8 << 20

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 def open(path: str | Path, *, threads: int = 0) -> Scene:
     """Open a scene file: frames by number or time, as integers or as float32 arrays.
 
-    Use it in a `with` statement. Raises what `packuv.scene.open_scene` raises.
+    Use it in a `with` statement. Raises what `packuv.scene.reader.open_scene` raises.
     """
     from packuv.scene import open_scene  # here, so that the package's other parts load without a video library
 

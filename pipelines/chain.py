@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from packuv.keyframes import fitting_order, promoted
+from packuv.motion.keyframes import fitting_order, promoted
 from pipelines.options import SequenceOptions
-from tasks.plan import Plan
-from tasks.splat import (
+from tasks.artefacts.store import Key
+from tasks.artefacts.workshop import Workshop
+from tasks.stages.fitting import (
     count_pictures,
     cut_segment,
     fit_first,
@@ -20,8 +21,7 @@ from tasks.splat import (
     read_losses,
     read_seam,
 )
-from tasks.store import Key
-from tasks.workshop import Workshop
+from tasks.stages.plan import Plan
 
 
 class Future(Protocol):

@@ -141,21 +141,30 @@ def parser() -> argparse.ArgumentParser:
         added.set_defaults(function=function, command=name)
         return added
 
-    _simulate(command("simulate", "pipelines.commands:simulate", "write a synthetic capture with exact ground truth"))
-    _run(command("run", "pipelines.run:command", "turn a capture folder into a scene file, with report"), stop=True)
+    _simulate(
+        command("simulate", "pipelines.commands.scenes:simulate", "write a synthetic capture with exact ground truth")
+    )
+    _run(
+        command("run", "pipelines.commands.run:command", "turn a capture folder into a scene file, with report"),
+        stop=True,
+    )
     for name, text in SINGLE.items():
-        _run(command(name, "pipelines.run:command", f"{text} (run --stop-after {name})"), stop=False)
-    _scene(command("info", "pipelines.commands:info", "show what a scene file holds"), json=True)
-    _verify(command("verify", "pipelines.commands:verify", "check a scene file bit by bit, or the artefacts of a run"))
+        _run(command(name, "pipelines.commands.run:command", f"{text} (run --stop-after {name})"), stop=False)
+    _scene(command("info", "pipelines.commands.scenes:info", "show what a scene file holds"), json=True)
+    _verify(
+        command(
+            "verify", "pipelines.commands.scenes:verify", "check a scene file bit by bit, or the artefacts of a run"
+        )
+    )
     _export(command("export", "", "write frames, cameras or the atlas of a scene for other programs"))
-    _import(command("import", "pipelines.exchange:import_splats", "turn splat files into a scene file"))
-    _atlas(command("atlas", "pipelines.exchange:atlas", "write the UV atlas of a frame as a picture"))
-    _web(command("web", "pipelines.exchange:web", "write a scene as static files for any web server"))
-    _render(command("render", "pipelines.commands:render", "write pictures of a scene as PNG files"))
-    _evaluate(command("eval", "pipelines.commands:evaluate", "score a scene against a capture"))
-    _view(command("view", "pipelines.commands:view", "show a scene in the web browser"))
-    _bench(command("bench", "pipelines.measure:measure", "run one of the benchmarks"))
-    command("doctor", "pipelines.doctor:doctor", "tell what this machine has and lacks")
+    _import(command("import", "pipelines.commands.exchange:import_splats", "turn splat files into a scene file"))
+    _atlas(command("atlas", "pipelines.commands.exchange:atlas", "write the UV atlas of a frame as a picture"))
+    _web(command("web", "pipelines.commands.exchange:web", "write a scene as static files for any web server"))
+    _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
+    _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
+    _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
+    _bench(command("bench", "pipelines.commands.measure:measure", "run one of the benchmarks"))
+    command("doctor", "pipelines.commands.doctor:doctor", "tell what this machine has and lacks")
     return top
 
 
@@ -223,7 +232,7 @@ def _export(export: argparse.ArgumentParser) -> None:
 
     def target(name: str, function: str, text: str) -> argparse.ArgumentParser:
         added = targets.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        added.set_defaults(function=f"pipelines.exchange:{function}", command="export")
+        added.set_defaults(function=f"pipelines.commands.exchange:{function}", command="export")
         return added
 
     _export_frames(target("frames", "export_frames", "write frames for other splat programs"))

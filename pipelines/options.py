@@ -6,18 +6,18 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from packuv.encoder import TOLERANCES, Quality
-from packuv.keyframes import KeyframeOptions
-from packuv.motion import MotionOptions
+from packuv.fit.options import FitOptions
+from packuv.motion.keyframes import KeyframeOptions
+from packuv.motion.step import MotionOptions
 from packuv.scene import EncodeOptions
-from packuv.solver import FitOptions
+from packuv.scene.encoder import TOLERANCES, Quality
 from pipelines.request import PRESETS, QUALITIES
 from sync.align import AlignOptions
 from sync.capture import CaptureSettings
-from tasks.calibrate import PointOptions, RigOptions
-from tasks.evaluate import EvaluateOptions
-from tasks.footage import PictureOptions
-from tasks.recipe import override
+from tasks.artefacts.recipe import override
+from tasks.stages.calibrate import PointOptions, RigOptions
+from tasks.stages.evaluate import EvaluateOptions
+from tasks.stages.footage import PictureOptions
 
 
 @dataclass(frozen=True)

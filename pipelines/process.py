@@ -12,21 +12,22 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from packuv.device import choose_device
+from packuv.fit.device import choose_device
 from pipelines.chain import Submit
+from pipelines.events import Event, Journal
 from pipelines.options import compose
-from pipelines.progress import Event, TerminalProgress
 from pipelines.request import RunRequest
 from pipelines.results import Run, collect, run_json
 from pipelines.stages import Made, run_stages
 from sync.capture import Capture, find_capture
-from tasks.encode import SCENE, encode_finished
-from tasks.jobs import Jobs
-from tasks.plan import Plan
-from tasks.report import write_report
-from tasks.report_facts import summary
-from tasks.store import Store, write_json
-from tasks.workshop import Workshop
+from tasks.artefacts.jobs import Jobs
+from tasks.artefacts.recipe import write_json
+from tasks.artefacts.store import Store
+from tasks.artefacts.workshop import Workshop
+from tasks.report.record import summary
+from tasks.report.write import write_report
+from tasks.stages.encode import SCENE, encode_finished
+from tasks.stages.plan import Plan
 
 RUN, PARTIAL = "run.json", "scene.partial.mkv"
 CORES_PER_JOB = 4
@@ -75,13 +76,13 @@ def _quality(figures: Mapping[str, Any]) -> Iterator[str]:
         yield f"size       {figures['mb_per_30_frames']:.2f} MB per 30 frames"
 
 
-def process_directly(request: RunRequest, progress: TerminalProgress) -> Outcome:
+def process_directly(request: RunRequest, journal: Journal) -> Outcome:
     """Process a sequence in this process and its jobs, without the workflow engine."""
     with ThreadPoolExecutor(max_workers=jobs_at_once(request)) as pool:
-        return process(request, progress, pool.submit)
+        return process(request, journal, pool.submit)
 
 
-def process(request: RunRequest, progress: TerminalProgress, submit: Submit) -> Outcome:
+def process(request: RunRequest, journal: Journal, submit: Submit) -> Outcome:
     """Process a sequence by stages that `submit` starts.
 
     Raises ValueError or FileNotFoundError for bad input, OSError when the disk cannot hold the results, and what a
@@ -95,8 +96,8 @@ def process(request: RunRequest, progress: TerminalProgress, submit: Submit) -> 
     folder = Path(request.out).absolute() / capture.name
     folder.mkdir(parents=True, exist_ok=True)
     jobs = Jobs(threads=max(1, _cores() // jobs_at_once(request)))
-    workshop = Workshop(Store(folder / "store"), jobs, progress)
-    run = Run(folder.name, request, options, plan, workshop, progress, started, Made())
+    workshop = Workshop(Store(folder / "store"), jobs, journal)
+    run = Run(folder.name, request, options, plan, workshop, journal, started, Made())
     try:
         run_stages(workshop, plan, options, request.stop_after, submit, run.made)
         return _publish(run, folder)
@@ -140,11 +141,11 @@ def _publish(run: Run, folder: Path) -> Outcome:
         scene = folder / SCENE
         place(run.workshop.path(key) / SCENE, scene)
         (folder / PARTIAL).unlink(missing_ok=True)
-    run.progress.started("report")
+    run.journal.started("report")
     content = collect(run)
     report = write_report(content, folder)
-    run.progress.ended("report")
-    return Outcome(folder, scene, report.page, summary(content), tuple(run.progress.events))
+    run.journal.ended("report")
+    return Outcome(folder, scene, report.page, summary(content), tuple(run.journal.events))
 
 
 def place(source: Path, target: Path) -> None:

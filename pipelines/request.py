@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tasks.recipe import OptionError
+from tasks.artefacts.recipe import OptionError
 
 PRESETS = ("draft", "standard", "high")
 QUALITIES = ("lossless", "high", "medium", "low")
-"""How near the scene file stays to the fit, see `packuv.encoder.TOLERANCES`"""
+"""How near the scene file stays to the fit, see `packuv.scene.encoder.TOLERANCES`"""
 STAGES = ("sync", "calibrate", "flow", "fit", "encode", "verify", "evaluate", "report")
 """In the order in which a run does them"""
 

@@ -18,21 +18,22 @@ import numpy as np
 from calibration.accept import RigReport
 from calibration.rig import Rig
 from packuv.scene import open_scene
+from packuv.score import read_table
+from pipelines.events import Event, Journal
 from pipelines.options import SequenceOptions
-from pipelines.progress import Event, TerminalProgress
 from pipelines.request import RunRequest
 from pipelines.stages import Made
 from sync.align import SyncReport
-from tasks.calibrate import CHECK
-from tasks.encode import SCENE
-from tasks.evaluate import PICTURES, TABLE, frame_scores, read_table
-from tasks.footage import RIG
-from tasks.plan import Plan
-from tasks.recipe import plain
-from tasks.report_facts import Comparison, MotionCurve, ReportInput, SceneFigures, StageRecord, scene_figures
-from tasks.store import Store
-from tasks.track import read_curve, read_keyframes
-from tasks.workshop import Workshop
+from tasks.artefacts.recipe import plain
+from tasks.artefacts.store import Store
+from tasks.artefacts.workshop import Workshop
+from tasks.report.facts import Comparison, MotionCurve, ReportInput, SceneFigures, StageRecord, scene_figures
+from tasks.stages.calibrate import CHECK
+from tasks.stages.encode import SCENE
+from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
+from tasks.stages.footage import RIG
+from tasks.stages.plan import Plan
+from tasks.stages.track import read_curve, read_keyframes
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Run:
     options: SequenceOptions
     plan: Plan
     workshop: Workshop
-    progress: TerminalProgress
+    journal: Journal
     started: datetime
     made: Made
 
@@ -57,7 +58,7 @@ class Run:
 
 def run_json(run: Run) -> dict[str, Any]:
     """Which artefacts with which options, what was skipped and why, and how long it took; also of a failed run."""
-    events = run.progress.events
+    events = run.journal.events
     return {
         "sequence": run.name,
         "packuv": version("packuv"),
@@ -105,7 +106,7 @@ def collect(run: Run) -> ReportInput:
         scores=_scores(run.folder("evaluate")),
         scene=_scene(run),
         pictures=tuple(_pictures(run.folder("evaluate"))),
-        stages=tuple(_stage(run.workshop.store, event) for event in run.progress.events),
+        stages=tuple(_stage(run.workshop.store, event) for event in run.journal.events),
     )
 
 

@@ -7,19 +7,19 @@ from typing import Any
 from prefect import flow
 from prefect.task_runners import ThreadPoolTaskRunner
 
+from pipelines.events import Journal
 from pipelines.process import Outcome, jobs_at_once, process
-from pipelines.progress import TerminalProgress
 from pipelines.request import RunRequest
 from tasks.engine import submit
 
 
 @flow(name="sequence", persist_result=False, validate_parameters=False)
-def process_sequence(request: RunRequest, progress: TerminalProgress | None = None) -> Outcome:
+def process_sequence(request: RunRequest, journal: Journal | None = None) -> Outcome:
     """From a capture folder to a scene file, with report."""
-    return process(request, progress or TerminalProgress(), submit)
+    return process(request, journal or Journal(), submit)
 
 
-def run_flow(request: RunRequest, progress: TerminalProgress) -> Outcome:
+def run_flow(request: RunRequest, journal: Journal) -> Outcome:
     """Run the flow here, with as many tasks at a time as the machine bears."""
     runner: ThreadPoolTaskRunner[Any] = ThreadPoolTaskRunner(max_workers=jobs_at_once(request))
-    return process_sequence.with_options(task_runner=runner)(request, progress)  # type: ignore[arg-type]
+    return process_sequence.with_options(task_runner=runner)(request, journal)  # type: ignore[arg-type]

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from tasks.jobs import die_with_parent
-from tasks.store import try_lock
+from tasks.artefacts.jobs import die_with_parent
+from tasks.artefacts.store import try_lock
 
 START_SECONDS = 300
 HOMES = 16

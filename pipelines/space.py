@@ -6,14 +6,14 @@ import errno
 import shutil
 from pathlib import Path
 
-from packuv.motion import fitted_size
+from packuv.motion.step import fitted_size
 from pipelines.options import SequenceOptions
 from sync.align import FrameGroups
-from tasks.footage import PictureOptions
-from tasks.plan import Plan
-from tasks.store import Key
-from tasks.synchronize import read_videos, selected
-from tasks.workshop import Workshop
+from tasks.artefacts.store import Key
+from tasks.artefacts.workshop import Workshop
+from tasks.stages.footage import PictureOptions
+from tasks.stages.plan import Plan
+from tasks.stages.synchronize import read_videos, selected
 
 MARGIN = 1.5
 """The forecast is rough, and others write to the disk, too"""

@@ -13,15 +13,15 @@ from pipelines.chain import Chain, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
-from tasks.calibrate import find_points, find_rig
-from tasks.encode import encode, verify
-from tasks.evaluate import evaluate
-from tasks.plan import Plan
-from tasks.splat import find_background
-from tasks.store import Key
-from tasks.synchronize import synchronize
-from tasks.track import choose_keyframes, find_motion, read_spans
-from tasks.workshop import Workshop
+from tasks.artefacts.store import Key
+from tasks.artefacts.workshop import Workshop
+from tasks.stages.calibrate import find_points, find_rig
+from tasks.stages.encode import encode, verify
+from tasks.stages.evaluate import evaluate
+from tasks.stages.fitting import find_background
+from tasks.stages.plan import Plan
+from tasks.stages.synchronize import synchronize
+from tasks.stages.track import choose_keyframes, find_motion, read_spans
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Stages as Prefect tasks: retried where that may help, shown as skipped where the artefact is there.
 
-Prefect caches and stores nothing (see tasks/store.py): tasks take and return keys, never arrays.
+Prefect caches and stores nothing (see tasks/artefacts/store.py): tasks take and return keys, never arrays.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from prefect.futures import PrefectFuture
 from prefect.states import Completed
 from prefect.tasks import exponential_backoff
 
-from tasks.jobs import JobDiedError
-from tasks.store import Key
+from tasks.artefacts.jobs import JobDiedError
+from tasks.artefacts.store import Key
 
 RETRIES = 2
 BACKOFF_SECONDS = 2

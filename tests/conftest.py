@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
+
+from tests.support.places import DATA
 
 
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder with recorded captures; tests that need them skip where it is absent."""
-    default = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
-    folder = Path(os.environ.get("PACKUV_DATA", default)).resolve()
-    if not folder.is_dir():
-        pytest.skip(f"no recorded captures at {folder}; set PACKUV_DATA")
-    return folder
+    if not DATA.is_dir():
+        pytest.skip(f"no recorded captures at {DATA}; set PACKUV_DATA")
+    return DATA
 
 
 @pytest.fixture(scope="session")

@@ -13,8 +13,8 @@ from pipelines.cli import parser
 from pipelines.options import compose
 from pipelines.request import read_settings
 from sync.capture import CaptureSettings
+from tests.support.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("pipelines", "tasks", "packuv", "sync", "calibration", "studio")
 
 

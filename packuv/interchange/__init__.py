@@ -9,12 +9,11 @@ from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 
+from packuv.gaussians.floats import DRAWN_LOGIT, SH_C0, Gaussians
 from packuv.interchange.compressed_ply import CHUNK, unpack, write_compressed_ply
-from packuv.interchange.conventions import DRAWN_LOGIT, SH_C0
 from packuv.interchange.ply import gaussians_of, read_tables, write_ply
 from packuv.interchange.sog import META, read_sog
 from packuv.interchange.spz import read_spz, write_spz
-from packuv.quantize import Gaussians
 
 __all__ = [
     "CHUNK",

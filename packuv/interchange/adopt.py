@@ -16,24 +16,22 @@ from typing import Any
 
 import numpy as np
 
+from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, SCALE, Codes, Quantizer, attribute_values
+from packuv.gaussians.floats import Gaussians, canonical, drawn, rows_of
+from packuv.gaussians.rows import first_appearance, with_rows
+from packuv.gaussians.segment import Segment
+from packuv.gaussians.uvmap import UvOptions, assign_slots, choose_centre
 from packuv.interchange import is_splats, read_gaussians
-from packuv.interchange.conventions import drawn
+from packuv.interchange.joined import equal_codes, segments_of
 from packuv.interchange.orbit import OrbitOptions, likeness, near_of, orbit
-from packuv.interchange.rows import equal_codes, segments_of
-from packuv.model import canonical, rows_of
-from packuv.quantize import OPACITY, OPACITY_RANGE, SCALE, Codes, Gaussians, Quantizer, attribute_values
+from packuv.progress import Progress, no_progress, part_of
 from packuv.scene import SceneHeader, open_scene, write_scene
-from packuv.segment import Segment
-from packuv.uvmap import UvOptions, assign_slots, choose_centre
 
 TAIL = 5e-5
 """Share of the values at either end of a column that its range need not hold; one stray value would coarsen all. With
 ten times as much, pictures of a fitted scene came 6 to 20 dB worse."""
 ROTATION_REACH = 0.7072
 """x, y and z of a canonical rotation are at most the square root of one half."""
-
-Progress = Callable[[int, int], None]
-"""Called with (steps done, steps in all)."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress: Progress | None = None) -> AdoptReport:
+def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress: Progress = no_progress) -> AdoptReport:
     """Write a scene file of splat files, one a frame, and tell what was lost.
 
     Every file is read twice, at most one segment is in memory. Raises ValueError for files without a drawn Gaussian or
@@ -128,21 +126,20 @@ def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress:
     """
     if not out.parent.is_dir():
         raise FileNotFoundError(f"no folder {out.parent} to write {out.name} in; make it first")
-    report = progress or (lambda done, total: None)
     count, steps = len(frames), 4 * len(frames)  # survey, map, encode, verify
     survey = _Survey(options)
     for done, path in enumerate(frames, start=1):
         survey.add(path)
-        report(done, steps)
+        progress(done, steps)
     header = _header(survey, frames, options)
     mapper = _Mapper(header.quantizer, options)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}.") as folder:
-        coded = _coded(frames, header.quantizer, options, lambda done: report(count + done, steps))
+        coded = _coded(frames, header.quantizer, options, lambda done: progress(count + done, steps))
         parts: list[Path] = []
         for segment in segments_of(coded, longest=options.segment_frames):
             parts.append(Path(folder, f"{len(parts):05d}.npz"))
             mapper.keep(segment).save(parts[-1])
-        summary = write_scene(out, parts, header, progress=lambda done, _: report(2 * count + done, steps))
+        summary = write_scene(out, parts, header, progress=part_of(progress, 2 * count, steps))
     pruned, finished = _compare(frames, out, options)
     drawn_count = survey.count - survey.undrawn
     return AdoptReport(
@@ -264,26 +261,6 @@ class _Mapper:
             self.kept += times * int((opacity[:, kept] > 0).sum())
             self.kept_alpha += times * float(alpha[:, kept].sum())
             self.alpha += times * float(alpha.sum())
-
-
-def first_appearance(segment: Segment) -> Codes:
-    """The codes of each row in the first frame that draws it; rows that none draws keep their key."""
-    xyz, attributes = segment.key.xyz.copy(), segment.key.attributes.copy()
-    moving = np.flatnonzero(segment.dynamic)
-    waiting = attributes[moving, OPACITY] == 0
-    for frame_xyz, frame_attributes in zip(segment.xyz, segment.attributes, strict=True):
-        here = waiting & (frame_attributes[:, OPACITY] > 0)
-        xyz[moving[here]], attributes[moving[here]] = frame_xyz[here], frame_attributes[here]
-        waiting &= ~here
-    return Codes(xyz, attributes)
-
-
-def with_rows(segment: Segment, rows: np.ndarray) -> Segment:
-    """Only the rows of a mask, bool [N]."""
-    moving = rows[segment.dynamic]
-    return Segment(
-        segment.first, segment.key[rows], segment.dynamic[rows], segment.xyz[:, moving], segment.attributes[:, moving]
-    )
 
 
 def _compare(frames: Sequence[Path], out: Path, options: AdoptOptions) -> tuple[list[float], list[float]]:

@@ -12,17 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.interchange.conventions import (
-    SH_C0,
-    alpha_codes,
-    drawn,
-    drop_largest,
-    logits_of_alpha,
-    restore_largest,
-)
+from packuv.gaussians.floats import SH_C0, Gaussians, drawn, rows_of
+from packuv.interchange.conventions import alpha_codes, drop_largest, logits_of_alpha, restore_largest
 from packuv.interchange.ply import columns_of, write_tables
-from packuv.model import rows_of
-from packuv.quantize import Gaussians
 
 CHUNK = 256
 """Gaussians per chunk."""

@@ -2,23 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import fields
-
 import numpy as np
-
-from packuv.quantize import Gaussians
-
-DRAWN_LOGIT = -math.log(254)
-"""Logit of alpha 1/255: renderers skip Gaussians below it, and so the writers leave them out."""
-SH_C0 = 0.5 / math.sqrt(math.pi)
-"""SH basis function of band 0."""
-
-
-def drawn(gaussians: Gaussians) -> Gaussians:
-    """Only those that a renderer would draw."""
-    rows = gaussians.opacity_logits >= DRAWN_LOGIT
-    return Gaussians(*(getattr(gaussians, field.name)[rows] for field in fields(Gaussians)))
 
 
 def alpha_codes(logits: np.ndarray) -> np.ndarray:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from packuv.camera import PinholeCamera
+from packuv.gaussians.floats import Gaussians
 from packuv.metrics import psnr
-from packuv.quantize import Gaussians
 from packuv.raster import RasterOptions, Workspace, render
 
 NEAR_SHARE = 0.02

@@ -11,8 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from packuv.files import whole_file
-from packuv.interchange.conventions import drawn
-from packuv.quantize import Gaussians
+from packuv.gaussians.floats import Gaussians, drawn
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",

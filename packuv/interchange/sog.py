@@ -17,8 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from packuv.gaussians.floats import Gaussians
 from packuv.interchange.conventions import logits_of_alpha, restore_largest
-from packuv.quantize import Gaussians
 
 META = "meta.json"
 PALETTE_ROW = 64

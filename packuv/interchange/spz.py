@@ -19,14 +19,8 @@ import numpy as np
 import pyarrow as pa
 
 from packuv.files import whole_file
-from packuv.interchange.conventions import (
-    alpha_codes,
-    drawn,
-    drop_largest,
-    logits_of_alpha,
-    restore_largest,
-)
-from packuv.quantize import Gaussians
+from packuv.gaussians.floats import Gaussians, drawn
+from packuv.interchange.conventions import alpha_codes, drop_largest, logits_of_alpha, restore_largest
 
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")

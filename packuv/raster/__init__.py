@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.quantize import Gaussians
+from packuv.gaussians.floats import Gaussians
 from packuv.raster import cpu
-from packuv.raster.cpu import Gradients, RasterOptions, Rendering, Workspace, tile_shape
+from packuv.raster.cpu import Rendering
+from packuv.raster.picture import Gradients, RasterOptions, tile_shape
+from packuv.raster.workspace import Workspace
 
 __all__ = ["Gradients", "RasterOptions", "Rendering", "Workspace", "gradients", "render", "tile_shape"]
 

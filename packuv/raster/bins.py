@@ -5,20 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from packuv.raster.kernel import kernel
-from packuv.raster.project import (
-    CHUNKS,
-    DEPTH,
-    INVERSE_VARIANCE_Y,
-    INVERSE_XX,
-    REACH,
-    RECORD,
-    SHEAR,
-    TILE,
-    X,
-    Y,
-)  # fmt: skip
-from packuv.raster.simd import (
+from packuv.kernels.compile import kernel
+from packuv.kernels.simd import (
     ALL,
     at_least,
     at_most,
@@ -33,7 +21,9 @@ from packuv.raster.simd import (
     splat,
     square_root,
     zeros,
-)  # fmt: skip
+)
+from packuv.raster.project import CHUNKS, DEPTH, INVERSE_VARIANCE_Y, INVERSE_XX, REACH, RECORD, SHEAR, X, Y
+from packuv.raster.view import TILE
 
 _f32 = np.float32
 _ROWS = np.array([4 * (lane % 4) + lane // 4 + 0.5 for lane in range(TILE)], np.float32)

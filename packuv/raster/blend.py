@@ -13,25 +13,8 @@ import math
 import numpy as np
 from numba import prange
 
-from packuv.raster.bins import GAUSSIAN, MASK, SLOT
-from packuv.raster.kernel import kernel
-from packuv.raster.project import (
-    ALPHA_MIN,
-    BLUE,
-    DEPTH,
-    EXPONENT_UNIT,
-    GREEN,
-    LOG_OPACITY,
-    RECORD,
-    RED,
-    TILE,
-    XX,
-    XY,
-    YY,
-    X,
-    Y,
-)
-from packuv.raster.simd import (
+from packuv.kernels.compile import kernel
+from packuv.kernels.simd import (
     ALL,
     WIDTH,
     above,
@@ -57,7 +40,10 @@ from packuv.raster.simd import (
     store_sums,
     sum_lanes,
     zeros,
-)  # fmt: skip
+)
+from packuv.raster.bins import GAUSSIAN, MASK, SLOT
+from packuv.raster.project import BLUE, DEPTH, EXPONENT_UNIT, GREEN, LOG_OPACITY, RECORD, RED, XX, XY, YY, X, Y
+from packuv.raster.view import ALPHA_MIN, TILE
 
 _f32 = np.float32
 _TRANSMITTANCE_MIN = _f32(1e-4)

@@ -6,94 +6,25 @@ threads, nor on the run.
 
 from __future__ import annotations
 
-import ctypes
-import math
-import sys
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
 
 import numba
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.quantize import Gaussians
+from packuv.gaussians.floats import Gaussians
+from packuv.kernels.compile import prefer_tbb
+from packuv.kernels.simd import WIDTH, Lanes, register_lanes
 from packuv.raster import bins, blend
-from packuv.raster.project import CHUNKS, RECORD, TILE, project, project_backward, view_constants
+from packuv.raster.picture import Gradients, RasterOptions, checked_tiles, tile_shape
+from packuv.raster.project import CHUNKS, RECORD, project, project_backward
 from packuv.raster.sh import MAX_DEGREE
-from packuv.raster.simd import WIDTH, Lanes, register_lanes
+from packuv.raster.view import TILE, view_constants
+from packuv.raster.workspace import Workspace
 
 BIN_CHUNKS = 16
 """Pieces of the depth order that are put into tiles side by side."""
-
-
-@dataclass(frozen=True)
-class RasterOptions:
-    """What every backend must agree on."""
-
-    near: float
-    """Gaussians whose centre is nearer than this along the viewing direction are not drawn; world units. No default:
-    it is a share of the rig's size, since cameras may sit in the wall they film."""
-    low_pass_px2: float = 0.3
-    """Added to both variances of every ellipse in the picture, pixels squared, as in 3D Gaussian Splatting."""
-    device: str = "cpu"
-    """cpu, or the name of a torch device that gsplat draws on"""
-
-    def __post_init__(self) -> None:
-        if not (self.near > 0 and self.low_pass_px2 > 0):
-            raise ValueError(
-                f"near plane and low-pass filter must be positive, but are {self.near}, {self.low_pass_px2}"
-            )
-
-
-class _Lease:
-    """Memory on loan; numpy arrays made from it keep it alive."""
-
-    def __init__(self, memory: np.ndarray, dtype: np.dtype, shape: tuple[int, ...]):
-        address, read_only = memory.__array_interface__["data"]
-        self.__array_interface__ = {
-            "version": 3, "typestr": dtype.str, "shape": shape, "data": (address, read_only),
-        }  # fmt: skip
-
-
-class Workspace:
-    """Memory for pictures and gradients, used again as soon as no array refers to it: a fit's memory stays flat.
-
-    Serves one thread at a time. An array that it handed out stays valid as long as anyone holds it or a view of it.
-    """
-
-    def __init__(self) -> None:
-        self._free: list[np.ndarray] = []
-
-    def take(self, shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
-        """An array, aligned to cache lines, whose content is undefined. O(number of free pieces)."""
-        shape = (shape,) if isinstance(shape, int) else shape
-        kind = np.dtype(dtype)
-        memory = self._memory(math.prod(shape) * kind.itemsize)
-        lease = _Lease(memory, kind, shape)
-        weakref.finalize(lease, self._free.append, memory).atexit = False
-        return np.asarray(lease)
-
-    @property
-    def free_bytes(self) -> int:
-        """Memory that waits for its next use."""
-        return sum(piece.size for piece in self._free)
-
-    def _memory(self, size: int) -> np.ndarray:
-        fitting = [i for i, piece in enumerate(self._free) if piece.size >= size]
-        if fitting:
-            return self._free.pop(min(fitting, key=lambda i: self._free[i].size))
-        if self._free:  # the largest is too small, and would only lie about
-            self._free.pop(max(range(len(self._free)), key=lambda i: self._free[i].size))
-        return _aligned(size + size // 4 + 64)
-
-
-def _aligned(size: int) -> np.ndarray:
-    raw = np.empty(size + 64, np.uint8)
-    skip = -raw.ctypes.data % 64
-    return raw[skip : skip + size]
 
 
 @dataclass(frozen=True)
@@ -143,31 +74,6 @@ class Rendering:
     def evaluation_count(self) -> int:
         """(Gaussian, pixel) pairs that were computed, idle lanes included."""
         return int(self._kept.visited.sum()) * WIDTH
-
-
-@dataclass(frozen=True)
-class Gradients:
-    """Derivatives of a scalar; zero in rows that were not asked for or not drawn."""
-
-    means: np.ndarray
-    """float32 [N, 3]"""
-    log_scales: np.ndarray
-    """float32 [N, 3]"""
-    quaternions: np.ndarray
-    """float32 [N, 4], of the quaternion as given, not normalised"""
-    opacity_logits: np.ndarray
-    """float32 [N]"""
-    sh: np.ndarray
-    """float32 [N, K, 3]; zero beyond the degree that was rendered"""
-    means2d: np.ndarray
-    """float32 [N, 2]: of the centre in the picture, per pixel"""
-    overflow_count: int
-    """Rows set to zero because their gradient was not finite"""
-
-
-def tile_shape(camera: PinholeCamera) -> tuple[int, int]:
-    """Rows and columns of tiles of 16 x 16 pixels that cover the picture."""
-    return -(-camera.height // TILE), -(-camera.width // TILE)
 
 
 def forward(
@@ -236,17 +142,6 @@ def backward(
     return Gradients(out[0], out[1], out[2], out[3], out[4], out[5], int(overflown.sum()))
 
 
-@cache
-def prefer_tbb() -> None:
-    """Load the environment's tbb, which numba does not find by itself, before numba chooses a threading layer.
-
-    Of numba's layers only tbb survives fork, spawn and several Python threads. Without it numba takes another.
-    """
-    library = Path(sys.prefix) / "lib" / "libtbb.so.12"
-    if library.exists():
-        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
-
-
 def _jobs() -> int:
     # More jobs than threads, since tiles differ in cost; results do not depend on it.
     return 8 * numba.get_num_threads()
@@ -277,17 +172,6 @@ def _flat(gradient: np.ndarray | None, picture: np.ndarray) -> np.ndarray:
     if gradient.shape != picture.shape:
         raise ValueError(f"the gradient of a picture {picture.shape} must have its shape, but has {gradient.shape}")
     return np.ascontiguousarray(gradient, np.float32).reshape(-1)
-
-
-def checked_tiles(tiles: np.ndarray | None, camera: PinholeCamera) -> np.ndarray:
-    """Active tiles as uint8 [tiles_y, tiles_x], all where None; raises ValueError if the shape does not fit."""
-    shape = tile_shape(camera)
-    if tiles is None:
-        return np.ones(shape, np.uint8)
-    if tiles.shape != shape or tiles.dtype != bool:
-        raise ValueError(f"tiles must be bool {shape} for a picture of {camera.width}x{camera.height} pixels, "
-                         f"but is {tiles.dtype} {tiles.shape}")  # fmt: skip
-    return np.ascontiguousarray(tiles).view(np.uint8)
 
 
 def _project(gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, workspace: Workspace

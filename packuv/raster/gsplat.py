@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from packuv.camera import PinholeCamera
-from packuv.quantize import Gaussians
-from packuv.raster.cpu import Gradients, RasterOptions, checked_tiles
-from packuv.raster.project import MAX_COLOUR, MAX_LENGTH, MAX_LOG_SCALE, TILE
+from packuv.gaussians.floats import Gaussians
+from packuv.raster.picture import Gradients, RasterOptions, checked_tiles
+from packuv.raster.view import MAX_COLOUR, MAX_LENGTH, MAX_LOG_SCALE, TILE
 
 _FAR = 1e10
 

@@ -12,22 +12,28 @@ import math
 import numpy as np
 from numba import prange
 
-from packuv.camera import PinholeCamera
+from packuv.kernels.compile import kernel
+from packuv.kernels.simd import ALL, load, store, zeros
 from packuv.raster import sh as harmonics
-from packuv.raster.kernel import kernel
-from packuv.raster.simd import ALL, load, store, zeros
+from packuv.raster.view import (
+    _CENTRE,
+    _LOW_PASS,
+    _SLOPE_LIMITS,
+    ALPHA_MIN,
+    MAX_COLOUR,
+    MAX_LENGTH,
+    MAX_LOG_SCALE,
+    VIEW_CX,
+    VIEW_CY,
+    VIEW_FX,
+    VIEW_FY,
+    VIEW_HEIGHT,
+    VIEW_NEAR,
+    VIEW_WIDTH,
+)
 
-TILE = 16
-"""Pixels along a side of a tile."""
 CHUNKS = 64
 """Pieces of work of a loop over Gaussians; fixed, so that no result depends on the number of threads."""
-ALPHA_MIN = 1.0 / 255.0
-MAX_LENGTH = 1e18
-"""World units; squares of larger positions leave the range of float32."""
-MAX_LOG_SCALE = 40.0
-MAX_COLOUR = 1e12
-MARGIN = 0.15
-"""The local linear map of a Gaussian outside the picture is taken at most this share of the picture beyond its edge."""
 
 # Columns of a record: one Gaussian as the blending needs it, a cache line of 16 float32.
 # alpha = 2 ** (8 (LOG_OPACITY + XX dx^2 + XY dx dy + YY dy^2)), the argument that `simd.exp2_8` takes
@@ -36,11 +42,6 @@ X, Y, XX, XY, YY, LOG_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
 SHEAR, INVERSE_XX, INVERSE_VARIANCE_Y, REACH = range(10, 14)
 RECORD = 16
 
-# Entries of a view.
-_ROTATION, _TRANSLATION, _CENTRE = 0, 9, 16
-VIEW_FX, VIEW_FY, VIEW_CX, VIEW_CY = 12, 13, 14, 15
-VIEW_WIDTH, VIEW_HEIGHT = 19, 20
-_SLOPE_LIMITS, VIEW_NEAR, _LOW_PASS = 21, 25, 26
 
 EXPONENT_UNIT = 8.0
 _LOG2E = 1.4426950408889634
@@ -49,18 +50,6 @@ _LOGIT_MIN = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
 _REACH_MAX = -2 * _LOG_ALPHA_MIN
 _f32 = np.float32
 _FAST = frozenset({"contract", "nsz"})
-
-
-def view_constants(camera: PinholeCamera, near: float, low_pass_px2: float) -> np.ndarray:
-    """Everything the kernels need to know of a camera, float64 [27]."""
-    width, height = camera.width, camera.height
-    x_low, x_high = -camera.cx - MARGIN * width, width - camera.cx + MARGIN * width
-    y_low, y_high = -camera.cy - MARGIN * height, height - camera.cy + MARGIN * height
-    return np.array([
-        *camera.camera_from_world[:3, :3].ravel(), *camera.camera_from_world[:3, 3],
-        camera.fx, camera.fy, camera.cx, camera.cy, *camera.centre, width, height,
-        x_low / camera.fx, x_high / camera.fx, y_low / camera.fy, y_high / camera.fy, near, low_pass_px2,
-    ], dtype=np.float64)  # fmt: skip
 
 
 @kernel(inline=True, fastmath=_FAST)

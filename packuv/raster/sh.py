@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from packuv.raster.kernel import kernel
+from packuv.kernels.compile import kernel
 
 MAX_DEGREE = 3
 

@@ -20,9 +20,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.quantize import Codes, Quantizer, attribute_count
+from packuv.gaussians.codes import Codes, Quantizer, attribute_count
+from packuv.gaussians.segment import Segment
 from packuv.scene import Scene, open_scene
-from packuv.segment import Segment
 
 NEAR_SHARE = 0.02
 """Near plane as a share of the cameras' median distance from their centre, where the scene names none"""
@@ -168,7 +168,7 @@ class SceneSource:
 
 @contextmanager
 def open_source(path: Path) -> Iterator[SceneSource]:
-    """A scene file to show; raises what `packuv.scene.open_scene` raises."""
+    """A scene file to show; raises what `packuv.scene.reader.open_scene` raises."""
     with open_scene(path) as scene:
         yield SceneSource(scene)
 

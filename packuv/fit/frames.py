@@ -1,0 +1,151 @@
+"""Fit the frames of a segment, each from the one before it (paper §4.2)."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from packuv.files import write_json, write_npz
+from packuv.fit.keyframe import DEAD_CODE, KeyState
+from packuv.fit.lift import lift_motion
+from packuv.fit.model import Model
+from packuv.fit.options import FitOptions
+from packuv.fit.shots import find_shots, moving_rows
+from packuv.fit.solver import Solver, tiled
+from packuv.fit.start.first import empty_gaussians
+from packuv.footage.views import Views
+from packuv.gaussians.codes import OPACITY, Codes
+from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity
+from packuv.gaussians.segment import Segment
+from packuv.motion.cache import MotionCache
+from packuv.progress import Progress, Ticks, no_progress
+
+
+def fit_segment(
+    key: KeyState,
+    views: Views,
+    instants: range,
+    *,
+    motion: MotionCache,
+    options: FitOptions,
+    scratch: Path,
+    progress: Progress = no_progress,
+) -> tuple[Segment, list[dict[str, float]]]:
+    """Fit the frames of one segment; `instants` starts with the keyframe's own. Also returns figures per frame.
+
+    After every frame the state goes to `scratch`, from which a later call continues with the same result.
+    """
+    if instants.start != key.instant:
+        raise ValueError(f"a segment starts at its keyframe, instant {key.instant}, not at {instants.start}")
+    track = Track.resume(key, options, scratch)
+    ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
+    for instant in instants[1 + len(track.frames) :]:
+        masks = [motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras]
+        flows = [motion.flow(motion.names.index(camera.name), instant) for camera in views.cameras]
+        track.add(_fit_frame(track.model, key, views, instant, masks, flows, options))
+        track.checkpoint()
+        ticks.advance()
+    return track.segment(), track.figures
+
+
+def _fit_frame(
+    model: Model,
+    key: KeyState,
+    views: Views,
+    instant: int,
+    masks: Sequence[np.ndarray | None],
+    flows: Sequence[np.ndarray | None],
+    options: FitOptions,
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Carry the model on to one instant; returns the rows that it changed, bool [N], and figures."""
+    started = time.monotonic()
+    rows = np.zeros(len(model), bool)
+    if not any(mask is not None and mask.any() for mask in masks):
+        return rows, {"instant": instant, "seconds": time.monotonic() - started, "iterations": 0, "dynamic": 0}
+    rng = np.random.default_rng([options.seed, instant, 2])
+    solver = Solver(model, key.bounds, options, rng)
+    solver.fix(key.quantizer)
+    rows = moving_rows(model.gaussians, key.quantizer, views, masks, key.bounds, options)
+    model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, flows, masks,
+                                               near=key.bounds.near, options=options.lift)  # fmt: skip
+    spare = opacity(model.gaussians) <= options.density.min_opacity
+    model.forget_moments(np.flatnonzero(rows | spare))
+    solver.free(rows | spare)
+    shots = tiled(find_shots(views, instant, masks), masks, solver, views)
+    loss, count = solver.settle(shots, options.frame_iterations)
+    changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
+    tiles = float(np.mean([shot.tiles.mean() for shot in shots if shot.tiles is not None]))
+    figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count,
+               "dynamic": int(changed.sum()), "tiles": tiles, "guarded": solver.guarded}  # fmt: skip
+    return changed, figures if loss is None else {**figures, "loss": loss}
+
+
+class Track:
+    """A segment while it is fitted: the model, and the codes and figures of the frames that are done."""
+
+    def __init__(self, key: KeyState, model: Model, scratch: Path) -> None:
+        self.model = model
+        self.frames: list[Codes] = []
+        self.figures: list[dict[str, float]] = []
+        self._key = key
+        self._scratch = scratch
+        self._first = key.quantizer.encode(model.gaussians)
+        self._changed = np.zeros(len(model), bool)
+
+    @classmethod
+    def resume(cls, key: KeyState, options: FitOptions, scratch: Path) -> Track:
+        """Where the last call was cut off, or at the keyframe."""
+        model = Model(key.gaussians)
+        model.append(empty_gaussians(options.spare, key.bounds, sh_degree=key.quantizer.sh_degree))
+        track = cls(key, model, scratch)
+        path = scratch / "track.json"
+        if path.exists():
+            track._load(json.loads(path.read_text())["figures"])
+        return track
+
+    def add(self, frame: tuple[np.ndarray, dict[str, float]]) -> None:
+        """Take over the model as the next frame; `frame` tells which rows it changed, and figures."""
+        rows, figures = frame
+        self._changed |= rows
+        self.frames.append(self._key.quantizer.encode(self.model.gaussians))
+        self.figures.append(figures)
+
+    def checkpoint(self) -> None:
+        """Everything a later call needs. The list of frames is written last and decides what counts."""
+        count = len(self.frames)
+        codes = self.frames[-1]
+        write_npz(self._scratch / f"frame_{count:06d}.npz", {"xyz": codes.xyz, "attributes": codes.attributes})
+        state = {name: getattr(self.model.gaussians, name) for name in ATTRIBUTES}
+        write_npz(self._scratch / f"state_{count:06d}.npz", {**state, "changed": self._changed})
+        write_json(self._scratch / "track.json", {"figures": self.figures})
+        (self._scratch / f"state_{count - 1:06d}.npz").unlink(missing_ok=True)
+
+    def segment(self) -> Segment:
+        """The codes of all frames; rows that are never visible are left out."""
+        ever = self._first.attributes[:, OPACITY] > DEAD_CODE
+        for codes in self.frames:
+            ever |= codes.attributes[:, OPACITY] > DEAD_CODE
+        dynamic = self._changed & ever
+        width = self._first.attributes.shape[1]
+        xyz = (
+            np.stack([c.xyz[dynamic] for c in self.frames])
+            if self.frames
+            else np.empty((0, dynamic.sum(), 3), np.uint16)
+        )
+        attributes = (np.stack([c.attributes[dynamic] for c in self.frames])
+                      if self.frames else np.empty((0, dynamic.sum(), width), np.uint8))  # fmt: skip
+        return Segment(self._key.instant, self._first[ever], dynamic[ever], xyz, attributes)
+
+    def _load(self, figures: list[dict[str, float]]) -> None:
+        count = len(figures)
+        with np.load(self._scratch / f"state_{count:06d}.npz") as data:
+            self.model.overwrite(np.arange(len(self.model)), Gaussians(*(data[name] for name in ATTRIBUTES)))
+            self._changed = data["changed"]
+        for number in range(1, count + 1):
+            with np.load(self._scratch / f"frame_{number:06d}.npz") as data:
+                self.frames.append(Codes(data["xyz"], data["attributes"]))
+        self.figures = figures

@@ -1,0 +1,270 @@
+"""Fit Gaussians to the pictures of many cameras: the keyframe chain and the frames of each segment (paper §4.2).
+
+    fit_first     pictures of one instant -> the first keyframe, and the quantizer of the whole sequence
+    fit_next      a keyframe and the pictures of another's instant -> that one; what did not change keeps its codes
+    fit_segment   a keyframe and the instants after it -> a `Segment`; frame by frame, from each to the next
+
+From the moment the quantizer is fixed every iteration renders decoded codes and the gradient passes straight through
+to float32 masters (low-precision optimisation), so the codes that are stored are the ones that were fitted.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from packuv.files import write_json, write_npz
+from packuv.fit.losses import photometric_loss
+from packuv.fit.model import Model
+from packuv.fit.options import FitOptions
+from packuv.fit.shots import Shot, find_shots, halved, moving_rows
+from packuv.fit.solver import Solver, tiled
+from packuv.fit.start.bounds import Bounds, find_bounds
+from packuv.fit.start.first import first_gaussians, neighbour_distance, round_gaussians
+from packuv.fit.start.hull import hull_points, in_hull
+from packuv.fit.start.points import Points, drawn, no_points
+from packuv.fit.start.shell import Shell, sweep_shell
+from packuv.footage.views import Views
+from packuv.gaussians.codes import OPACITY_RANGE, Quantizer, attribute_values
+from packuv.gaussians.floats import ATTRIBUTES, Gaussians, canonical
+from packuv.motion.background import Still
+from packuv.motion.step import MotionOptions, difference
+from packuv.progress import Progress, Ticks, no_progress
+from packuv.raster import RasterOptions, Workspace, render
+
+VERSION = 5
+"""Raised with every change that alters what a fit returns"""
+
+DEAD_CODE = 1
+"""Opacity codes up to this one decode below 1/255, which no renderer draws"""
+
+
+@dataclass(frozen=True)
+class KeyState:
+    """A fitted keyframe, from which segments and the next keyframe start."""
+
+    instant: int
+    gaussians: Gaussians
+    """float32 masters, not rounded to codes"""
+    quantizer: Quantizer
+    bounds: Bounds
+    figures: Mapping[str, float]
+    """What the fit measured: seconds, loss, Gaussians"""
+
+    def save(self, folder: Path) -> None:
+        """Write state.npz and key.json."""
+        write_npz(folder / "state.npz", {name: getattr(self.gaussians, name) for name in ATTRIBUTES})
+        bounds = {"centre": self.bounds.centre.tolist(), "radius": self.bounds.radius, "near": self.bounds.near}
+        write_json(folder / "key.json", {"instant": self.instant, "quantizer": self.quantizer.to_json(),
+                                         "bounds": bounds, "figures": dict(self.figures)})  # fmt: skip
+
+    @classmethod
+    def load(cls, folder: Path) -> KeyState:
+        data = json.loads((folder / "key.json").read_text())
+        bounds = Bounds(np.array(data["bounds"]["centre"]), data["bounds"]["radius"], data["bounds"]["near"])
+        with np.load(folder / "state.npz") as arrays:
+            gaussians = Gaussians(*(arrays[name] for name in ATTRIBUTES))
+        return cls(data["instant"], gaussians, Quantizer.from_json(data["quantizer"]), bounds, data["figures"])
+
+
+def fit_first(
+    views: Views,
+    instant: int,
+    *,
+    points: Points | None,
+    stills: Sequence[Still],
+    motion: MotionOptions,
+    options: FitOptions,
+    progress: Progress = no_progress,
+) -> KeyState:
+    """Fit the first keyframe from sparse points, the shell around the scene and random Gaussians: the background of
+    the sequence first, then what stands before it.
+
+    `views` must hold the cameras to fit and no others; `stills` are their backgrounds, or empty. Raises ValueError if
+    fewer than two have a picture.
+    """
+    started = time.monotonic()
+    shots = find_shots(views, instant)
+    still_shots = [Shot(views.cameras[s.camera], views.balanced(s.camera, s.pixels), known=s.known) for s in stills]
+    with_background = len(still_shots) >= len(shots)
+    first = still_shots if with_background else shots
+    bounds = find_bounds(views.cameras, near_share=options.near_share)
+    rng = np.random.default_rng([options.seed, instant, 0])
+    cameras, targets = [shot.camera for shot in first], [shot.target for shot in first]
+    shell = sweep_shell(cameras, targets, bounds=bounds, options=options.shell) if options.shell.enabled else None
+    start = first_gaussians(cameras, targets, bounds=bounds, surface=_surface(shell, points, options),
+                            options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
+    model = Model(start)
+    solver = Solver(model, bounds, options, rng)
+    total = options.iterations
+    ticks = Ticks(progress, total)
+    coarse, floating = round(total * options.coarse_share), round(total * options.float_share)
+    solver.run([halved(shot) for shot in first], coarse, of=total, dense=True, ticks=ticks)
+    if shell is not None:
+        depths = (shell.depths(camera, index, bounds.near) for index, camera in enumerate(cameras))
+        first = [replace(shot, depths=known) for shot, known in zip(first, depths, strict=True)]
+    if with_background:
+        solver.run(first, round(total * options.background.iteration_share) - coarse, of=total, dense=True, ticks=ticks)
+        masks = _before_background(views, instant, stills, motion)
+        solver.append(_hull_gaussians(views, instant, masks, bounds, options, rng, options.sh_degree))
+    else:
+        shots = first
+    solver.run(shots, floating - solver.done, of=total, dense=True, ticks=ticks)
+    solver.keep(solver.worth_keeping())
+    model.gaussians = canonical(model.gaussians)
+    model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
+    degree = needed_degree(model.gaussians, shots, near=bounds.near, options=options)
+    model.limit_sh(degree)
+    solver.fix(choose_quantizer(model.gaussians, bounds, degree))
+    loss = solver.run(shots, total - floating, of=total, ticks=ticks)
+    return KeyState(instant, model.gaussians, solver.known_quantizer, bounds, _figures(started, loss, solver))
+
+
+def fit_next(
+    previous: KeyState,
+    views: Views,
+    instant: int,
+    *,
+    masks: Sequence[np.ndarray | None],
+    stills: Sequence[Still],
+    motion: MotionOptions,
+    options: FitOptions,
+    progress: Progress = no_progress,
+) -> KeyState:
+    """Fit a keyframe from a neighbouring one, later or earlier.
+
+    `masks` tell, per camera of `views`, what differs between the two instants, bool [H, W] (None: unknown, the whole
+    picture may). Gaussians that touch no mask keep every code. What stood before the background and has gone is
+    dropped, and new Gaussians are born in the hull of what stands there now; `stills` may be empty, then nothing is
+    known to have gone. What exceeds the cap makes room: of the Gaussians that may change, those that show least.
+    """
+    started = time.monotonic()
+    bounds, quantizer = previous.bounds, previous.quantizer
+    rng = np.random.default_rng([options.seed, instant, 1])
+    model = Model(previous.gaussians)
+    solver = Solver(model, bounds, options, rng)
+    solver.fix(quantizer)
+    shots = find_shots(views, instant, masks)
+    if not shots:
+        return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, 0.0, solver))
+    before, after = (_before_background(views, i, stills, motion) for i in (previous.instant, instant))
+    gone = _inside(model.gaussians, views, before, bounds, options)
+    gone &= ~_inside(model.gaussians, views, after, bounds, options)
+    solver.keep(~gone)
+    solver.free(moving_rows(model.gaussians, quantizer, views, masks, bounds, options))
+    solver.make_room(shots)
+    seen = [mask if alone is None else alone for alone, mask in zip(after, masks, strict=True)]
+    solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
+    shots = tiled(shots, masks, solver, views)
+    loss = solver.run(shots, options.key_iterations, of=options.key_iterations, dense=True,
+                      ticks=Ticks(progress, options.key_iterations))  # fmt: skip
+    solver.keep(~solver.rows | solver.worth_keeping())
+    return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, loss, solver))
+
+
+def _before_background(
+    views: Views, instant: int, stills: Sequence[Still], motion: MotionOptions
+) -> list[np.ndarray | None]:
+    """What each camera's picture shows that its background lacks, bool [H, W]; None without one of the two."""
+    masks: list[np.ndarray | None] = [None] * len(views.cameras)
+    for still in stills:
+        pixels = views.pixels(still.camera, instant)
+        masks[still.camera] = None if pixels is None else difference(still.pixels, pixels, motion)
+    return masks
+
+
+def _inside(
+    gaussians: Gaussians,
+    views: Views,
+    masks: Sequence[np.ndarray | None],
+    bounds: Bounds,
+    options: FitOptions,
+) -> np.ndarray:
+    """Gaussians in the hull of the masks, bool [N]; none if too few cameras have one."""
+    seeing = [(camera, mask) for camera, mask in zip(views.cameras, masks, strict=True) if mask is not None]
+    if len(seeing) < min(options.start.min_views, len(views.cameras)):
+        return np.zeros(len(gaussians), bool)
+    cameras, known = [pair[0] for pair in seeing], [pair[1] for pair in seeing]
+    return in_hull(gaussians.means.astype(np.float64), cameras, known, bounds=bounds, options=options.start)
+
+
+def _surface(shell: Shell | None, points: Points | None, options: FitOptions) -> Points:
+    """Where surfaces are: sparse points, sure places of the shell, and the rest of the shell evenly."""
+    start, rng = options.start, np.random.default_rng([options.seed, 3])
+    room = round(start.count * start.surface_share)
+    parts = [] if points is None else [drawn(points, room, rng)]
+    if shell is not None:
+        parts.append(shell.sure_points(room - sum(len(part.xyz) for part in parts), rng))
+        parts.append(shell.cover(round(start.count * start.shell_share)))
+    parts = parts or [no_points()]
+    return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
+
+
+def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, options: FitOptions) -> int:
+    """The lowest SH degree whose pictures are nearly as good as those of all bands: view dependence that a scene does
+    not show is not carried. Nothing is fitted again, so a band that helps is kept rather than lost."""
+    full, workspace, raster = options.sh_degree, Workspace(), RasterOptions(near, device=options.device)
+
+    def loss(degree: int) -> float:
+        cut = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
+        drawn = (render(cut, s.camera, options=raster, workspace=workspace).colour for s in shots)
+        values = [photometric_loss(picture, shot.target, options=options.photometric).value
+                  for picture, shot in zip(drawn, shots, strict=True)]  # fmt: skip
+        return float(np.mean(values))
+
+    if not full:
+        return 0
+    enough = loss(full) * (1 + options.sh_gain)
+    return next(degree for degree in range(full + 1) if degree == full or loss(degree) <= enough)
+
+
+def choose_quantizer(gaussians: Gaussians, bounds: Bounds, sh_degree: int) -> Quantizer:
+    """Ranges from the first keyframe with room for what later frames bring; frozen for the sequence."""
+    values = attribute_values(gaussians)  # [N, A]
+    low, high = (np.quantile(values, q, axis=0).astype(np.float64) for q in (0.0005, 0.9995))
+    margin = 0.15 * np.maximum(high - low, 1e-3)
+    low, high = low - margin, high + margin
+    # Axes trade places while they are fitted: one range for all three.
+    low[:3], high[:3] = low[:3].min(), high[:3].max()
+    # A canonical rotation starts below 0.71 and may turn on by some ten degrees.
+    low[3:6], high[3:6] = -0.8, 0.8
+    low[6], high[6] = OPACITY_RANGE
+    # What comes into view later may have any colour of the picture.
+    low[7:10], high[7:10] = np.minimum(low[7:10], -1.9).min(), np.maximum(high[7:10], 1.9).max()
+    if sh_degree > 0:
+        reach = max(np.abs(low[10:]).max(), np.abs(high[10:]).max())
+        low[10:], high[10:] = -reach, reach
+    distance = np.abs(gaussians.means.astype(np.float64) - bounds.centre).max(axis=0)
+    reach_xyz = 1.1 * np.maximum(distance, 1.5 * bounds.radius)
+    return Quantizer(bounds.centre.copy(), 0.5 * bounds.radius, reach_xyz, low, high, sh_degree)
+
+
+def _hull_gaussians(
+    views: Views,
+    instant: int,
+    masks: Sequence[np.ndarray | None],
+    bounds: Bounds,
+    options: FitOptions,
+    rng: np.random.Generator,
+    sh_degree: int,
+) -> Gaussians:
+    """New Gaussians inside the hull of the masks: what moved there since the last keyframe has none yet."""
+    found = [(camera, views.picture(i, instant), masks[i]) for i, camera in enumerate(views.cameras)]
+    seeing = [(camera, picture, mask) for camera, picture, mask in found if picture is not None and mask is not None]
+    points = hull_points([s[0] for s in seeing], [s[1] for s in seeing], [s[2] for s in seeing], bounds=bounds,
+                         options=options.start, count=options.key_births, rng=rng)  # fmt: skip
+    spacing = neighbour_distance(points.xyz.astype(np.float32))
+    scale = np.clip(spacing, 1e-4 * bounds.radius, 0.02 * bounds.radius)
+    born = round_gaussians(points.xyz, points.rgb, scale, opacity=options.start.opacity, sh_degree=sh_degree)
+    return canonical(born)
+
+
+def _figures(started: float, loss: float, solver: Solver) -> dict[str, float]:
+    return {"seconds": time.monotonic() - started, "loss": loss, "gaussians": len(solver.model),
+            "changed": int(solver.rows.sum()), "iterations": solver.done, "guarded": solver.guarded,
+            "saturated": solver.known_quantizer.saturation(solver.model.gaussians)}  # fmt: skip

@@ -1,0 +1,351 @@
+"""Which Gaussians move, and which parts of a picture they touch (paper §4.2.2 and appendix, algorithm 4).
+
+A Gaussian is dynamic if its ellipse in the picture overlaps a camera's motion mask. The paper joins cameras by OR; as
+the mask of a camera also covers everything behind and before what moves, that makes half of a room's wall dynamic when
+many cameras look inward. By default most of the cameras that see a Gaussian must agree: what moves lies in the mask of
+nearly every camera that sees it, the wall behind it only in a few. `least_share=0` is the paper's rule.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import prange
+
+from packuv.camera import PinholeCamera
+from packuv.gaussians.floats import Gaussians
+from packuv.kernels.compile import kernel, prefer_tbb
+from packuv.raster.view import MARGIN, TILE
+
+CHUNKS = 64
+"""Pieces of work, whatever the number of threads."""
+
+LEAST_OPACITY = 1 / 255
+"""Renderers skip a Gaussian that is fainter, so it touches nothing."""
+
+
+@dataclass(frozen=True)
+class LabelOptions:
+    """When a Gaussian counts as dynamic."""
+
+    sigmas: float = 3.0
+    """Size of the ellipse, in standard deviations (paper: Mahalanobis distance squared <= 9)"""
+    low_pass_px2: float = 0.3
+    """Added to the variances in the picture, as the renderer does"""
+    radius_limit_px: float = 400.0
+    """A larger ellipse is cut off here: near the camera the projection's linear map means little"""
+    least_overlap: float = 0.4
+    """Share of the ellipse's pixels in the picture that must be in the mask; 0: a single pixel, as in the paper. A wide
+    faint Gaussian that touches a mask would make every tile that it reaches active: 99 % of them on a real capture at
+    0, 43 % at 0.4, at equal error"""
+    min_cameras: int = 1
+    """Cameras whose mask must be hit; 1 is the paper's OR"""
+    least_share: float = 0.6
+    """Share of the cameras that see a Gaussian whose mask must be hit; 0 is the paper's OR. With 27 cameras around two
+    people, OR labels 46 % of a wall and 70 % of the empty room, this 2 % and 0.5 %; 1 % and 0.5 % are in every mask"""
+    depth_tolerance: float = 0.05
+    """A centre deeper than the depth map by more than this share is hidden, and that camera has no say"""
+    centres_only: bool = False
+    """The paper's fallback: only the pixel under the centre counts"""
+
+    def __post_init__(self) -> None:
+        if not (self.sigmas > 0 and self.low_pass_px2 >= 0 and self.radius_limit_px > 0 and self.min_cameras >= 1):
+            raise ValueError(
+                "labels need sigmas > 0, low_pass_px2 >= 0, radius_limit_px > 0 and min_cameras >= 1, but have "
+                f"{self.sigmas}, {self.low_pass_px2}, {self.radius_limit_px} and {self.min_cameras}"
+            )
+        if not (0 <= self.least_overlap <= 1 and 0 <= self.least_share <= 1 and self.depth_tolerance >= 0):
+            raise ValueError(
+                "least_overlap and least_share are shares from 0 to 1 and depth_tolerance is not negative, but they "
+                f"are {self.least_overlap}, {self.least_share} and {self.depth_tolerance}"
+            )
+
+
+def dynamic_labels(
+    gaussians: Gaussians,
+    cameras: Sequence[PinholeCamera],
+    masks: Sequence[np.ndarray | None],
+    *,
+    near: float,
+    options: LabelOptions,
+    depths: Sequence[np.ndarray | None] | None = None,
+    device: str = "cpu",
+) -> np.ndarray:  # bool [N]
+    """Which Gaussians overlap the motion masks, bool [H, W] per camera at the camera's size.
+
+    A camera without a mask (None) has no say, nor has one nearer than `near` to the Gaussian, or one where the
+    Gaussian is hidden by `depths` (float [H, W] along the camera's z axis; 0 or NaN where nothing is). A mask that
+    is empty does have a say: it saw no motion. Takes O(N * cameras * rows of the ellipse), whatever its width.
+    `device` "cpu" or "cuda" tells who counts.
+    """
+    hits, views = count_hits(gaussians, cameras, masks, near=near, options=options, depths=depths, device=device)
+    return np.asarray((hits >= options.min_cameras) & (hits >= options.least_share * views))
+
+
+def count_hits(
+    gaussians: Gaussians,
+    cameras: Sequence[PinholeCamera],
+    masks: Sequence[np.ndarray | None],
+    *,
+    near: float,
+    options: LabelOptions,
+    depths: Sequence[np.ndarray | None] | None = None,
+    device: str = "cpu",
+) -> tuple[np.ndarray, np.ndarray]:
+    """Per Gaussian, the cameras whose mask it overlaps and the cameras that see it, int32 [N] each.
+
+    A camera sees a Gaussian whose centre is in its picture, or that overlaps its mask.
+    """
+    if len(masks) != len(cameras) or (depths is not None and len(depths) != len(cameras)):
+        raise ValueError(f"{len(cameras)} cameras need a mask each (or None), and a depth map each if any is given")
+    covariance, visible = _world_covariance(gaussians), _visible(gaussians)
+    rule = np.array([options.sigmas, options.radius_limit_px, options.least_overlap, 1 + options.depth_tolerance,
+                     options.centres_only], dtype=np.float64)  # fmt: skip
+    nowhere = np.zeros((0, 0), np.float32)
+    voters = (
+        (_view(camera, near, options.low_pass_px2), summed_area(_check_picture(mask, camera, "mask")),
+         nowhere if depth is None else np.ascontiguousarray(_check_picture(depth, camera, "depth"), np.float32))
+        for camera, mask, depth in zip(cameras, masks, depths or [None] * len(cameras), strict=True) if mask is not None
+    )  # fmt: skip
+    if device != "cpu":
+        from packuv.fit.labels_cuda import count_on_gpu
+
+        return count_on_gpu(_opinion, gaussians.means, covariance, visible, list(voters), rule)
+    hits, views = np.zeros(len(gaussians), dtype=np.int32), np.zeros(len(gaussians), dtype=np.int32)
+    for view, table, depth in voters:
+        _vote(gaussians.means, covariance, visible, view, table, depth, rule, hits, views)
+    return hits, views
+
+
+def active_tiles(
+    mask: np.ndarray | None,
+    moving: Gaussians,
+    camera: PinholeCamera,
+    *,
+    near: float = 0.0,
+    low_pass_px2: float = 0.3,
+) -> np.ndarray:  # bool [tiles_y, tiles_x]
+    """Tiles of 16 x 16 pixels that the motion mask (bool [H, W]) or a moving Gaussian touches.
+
+    A Gaussian reaches as far as its alpha is 1/255 or more, which is where every renderer draws it. Without a mask
+    everything is active. Pass the renderer's `near`: a Gaussian closer to the camera is not drawn.
+    """
+    rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
+    if mask is None:
+        return np.ones((rows, columns), dtype=bool)
+    _check_picture(mask, camera, "mask")
+    padded = np.pad(mask, ((0, rows * TILE - camera.height), (0, columns * TILE - camera.width)))
+    tiles = np.asarray(padded.reshape(rows, TILE, columns, TILE).any(axis=(1, 3)))
+    opacity = 1 / (1 + np.exp(-moving.opacity_logits.astype(np.float64)))
+    reach = np.sqrt(2 * np.log(np.maximum(255 * opacity, 1)))  # in standard deviations, [N]
+    _touch(moving.means, _world_covariance(moving), _visible(moving), reach, _view(camera, near, low_pass_px2), tiles)
+    return tiles
+
+
+def summed_area(mask: np.ndarray) -> np.ndarray:
+    """int32 [H + 1, W + 1]: number of true pixels above and left of each corner."""
+    table = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), dtype=np.int32)
+    np.cumsum(np.cumsum(mask, axis=0, dtype=np.int32), axis=1, dtype=np.int32, out=table[1:, 1:])
+    return table
+
+
+def _check_picture(picture: np.ndarray, camera: PinholeCamera, name: str) -> np.ndarray:
+    if picture.shape != (camera.height, camera.width):
+        raise ValueError(
+            f"camera {camera.name!r}: the {name} must be [{camera.height}, {camera.width}], but is {picture.shape}"
+        )
+    return picture
+
+
+def _visible(gaussians: Gaussians) -> np.ndarray:
+    """Gaussians that renderers draw at all, bool [N]."""
+    return np.asarray(gaussians.opacity_logits >= -math.log(1 / LEAST_OPACITY - 1))
+
+
+def _world_covariance(gaussians: Gaussians) -> np.ndarray:
+    """xx xy xz yy yz zz of R S S R^T, world, float64 [N, 6]."""
+    prefer_tbb()
+    out = np.empty((len(gaussians), 6))
+    _covariances(gaussians.quaternions, gaussians.log_scales, out)
+    return out
+
+
+@kernel(parallel=True)
+def _covariances(quaternions, log_scales, out):
+    count = len(out)
+    for chunk in prange(CHUNKS):
+        for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
+            w, x, y, z = (np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]),
+                          np.float64(quaternions[i, 3]))  # fmt: skip
+            unit = 1 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+            w, x, y, z = w * unit, x * unit, y * unit, z * unit
+            out[i] = 0
+            for axis in range(3):
+                if axis == 0:
+                    a, b, c = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
+                elif axis == 1:
+                    a, b, c = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
+                else:
+                    a, b, c = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+                variance = math.exp(2 * np.float64(log_scales[i, axis]))
+                out[i, 0] += variance * a * a
+                out[i, 1] += variance * a * b
+                out[i, 2] += variance * a * c
+                out[i, 3] += variance * b * b
+                out[i, 4] += variance * b * c
+                out[i, 5] += variance * c * c
+
+
+def _view(camera: PinholeCamera, near: float, low_pass_px2: float) -> np.ndarray:
+    """What the kernels need of a camera, float64 [24]: rotation 0-8, translation 9-11, fx fy cx cy 12-15, width and
+    height 16-17, limits of x/z and y/z 18-21, near 22, low pass 23. Beyond the limits the renderer, too, takes the
+    projection's linear map at the limit."""
+    width, height = camera.width, camera.height
+    return np.array([
+        *camera.camera_from_world[:3, :3].ravel(), *camera.camera_from_world[:3, 3],
+        camera.fx, camera.fy, camera.cx, camera.cy, width, height,
+        (-MARGIN * width - camera.cx) / camera.fx, ((1 + MARGIN) * width - camera.cx) / camera.fx,
+        (-MARGIN * height - camera.cy) / camera.fy, ((1 + MARGIN) * height - camera.cy) / camera.fy,
+        near, low_pass_px2,
+    ], dtype=np.float64)  # fmt: skip
+
+
+@kernel()
+def _project(means, covariance, view, i):
+    """Pixel x and y of the centre, its depth, xx xy yy of the covariance in the picture; depth 0 if it has none."""
+    px, py, pz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+    x = view[0] * px + view[1] * py + view[2] * pz + view[9]
+    y = view[3] * px + view[4] * py + view[5] * pz + view[10]
+    z = view[6] * px + view[7] * py + view[8] * pz + view[11]
+    if not (z > 0 and z >= view[22]):
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    slope_x, slope_y = min(max(x / z, view[18]), view[19]), min(max(y / z, view[20]), view[21])
+    a, b = view[12] / z, view[13] / z
+    u0, u1, u2 = a * (view[0] - slope_x * view[6]), a * (view[1] - slope_x * view[7]), a * (view[2] - slope_x * view[8])
+    v0, v1, v2 = b * (view[3] - slope_y * view[6]), b * (view[4] - slope_y * view[7]), b * (view[5] - slope_y * view[8])
+    c = covariance[i]
+    s0, s1, s2 = c[0] * u0 + c[1] * u1 + c[2] * u2, c[1] * u0 + c[3] * u1 + c[4] * u2, c[2] * u0 + c[4] * u1 + c[5] * u2
+    t0, t1, t2 = c[0] * v0 + c[1] * v1 + c[2] * v2, c[1] * v0 + c[3] * v1 + c[4] * v2, c[2] * v0 + c[4] * v1 + c[5] * v2
+    xx, xy, yy = u0 * s0 + u1 * s1 + u2 * s2, u0 * t0 + u1 * t1 + u2 * t2, v0 * t0 + v1 * t1 + v2 * t2
+    return view[12] * x / z + view[14], view[13] * y / z + view[15], z, xx + view[23], xy, yy + view[23]
+
+
+@kernel()
+def _row_span(x, y, xx, xy, yy, square, limit, width, row):
+    """Pixels of a row, half-open, whose centres lie in the ellipse d^2 <= square and within `limit`."""
+    dy = row + 0.5 - y
+    # d^2 = dy^2 / yy + (dx - dy xy / yy)^2 / (xx - xy^2 / yy)
+    rest = (square - dy * dy / yy) * (xx - xy * xy / yy)
+    if not rest >= 0:
+        return 0, 0
+    middle, half = x + dy * xy / yy, math.sqrt(rest)
+    low, high = max(middle - half, x - limit), min(middle + half, x + limit)
+    return int(max(math.ceil(low - 0.5), 0.0)), int(min(math.floor(high - 0.5) + 1.0, width))
+
+
+@kernel()
+def _rows(y, yy, sigmas, limit, height):
+    """First row, and the one past the last, that an ellipse reaches."""
+    half = min(sigmas * math.sqrt(yy), limit)
+    return int(max(math.ceil(y - half - 0.5), 0.0)), int(min(math.floor(y + half - 0.5) + 1.0, height))
+
+
+@kernel()
+def _overlap(x, y, xx, xy, yy, sigmas, limit, table):
+    """Pixels of the ellipse that are in the picture, and those of them that are in the mask."""
+    height, width = table.shape[0] - 1, table.shape[1] - 1
+    inside = masked = 0
+    first, end = _rows(y, yy, sigmas, limit, height)
+    for row in range(first, end):
+        left, right = _row_span(x, y, xx, xy, yy, sigmas * sigmas, limit, width, row)
+        if left < right:
+            inside += right - left
+            masked += table[row + 1, right] - table[row + 1, left] - table[row, right] + table[row, left]
+    return inside, masked
+
+
+@kernel()
+def _box_is_clear(x, y, xx, yy, sigmas, limit, table):
+    """Whether no masked pixel lies in the ellipse's bounding box."""
+    height, width = table.shape[0] - 1, table.shape[1] - 1
+    top, bottom = _rows(y, yy, sigmas, limit, height)
+    left, right = _rows(x, xx, sigmas, limit, width)
+    if top >= bottom or left >= right:
+        return True
+    return table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left] == 0
+
+
+@kernel()
+def _is_hidden(x, y, z, depth, slack):
+    row, column = math.floor(y), math.floor(x)
+    if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
+        return False
+    return depth[row, column] > 0 and z > depth[row, column] * slack
+
+
+@kernel()
+def _is_hit(x, y, xx, xy, yy, rule, table):
+    """Whether the mask holds enough of an ellipse; `rule` as in `_vote`."""
+    sigmas, limit, least_overlap = rule[0], rule[1], rule[2]
+    if _box_is_clear(x, y, xx, yy, sigmas, limit, table):
+        return False
+    inside, masked = _overlap(x, y, xx, xy, yy, sigmas, limit, table)
+    return masked > 0 and masked >= least_overlap * inside
+
+
+@kernel()
+def _pixel(x, y, table):
+    """Whether the pixel under a point in the picture is in the mask."""
+    row, column = math.floor(y), math.floor(x)
+    return table[row + 1, column + 1] - table[row, column + 1] - table[row + 1, column] + table[row, column] > 0
+
+
+@kernel()
+def _opinion(means, covariance, view, table, depth, rule, i):
+    """One camera of one Gaussian: whether it sees it, and whether its mask is hit as well.
+
+    `rule`, float64 [5]: sigmas, radius limit, least overlap, depth slack, and whether only centres count.
+    """
+    x, y, z, xx, xy, yy = _project(means, covariance, view, i)
+    # Algorithm 4, step 3; the comparisons also refuse what is not a number.
+    if not (z > 0 and xx * yy - xy * xy > 1e-7 and abs(x) < 1e9 and abs(y) < 1e9):
+        return False, False
+    if _is_hidden(x, y, z, depth, rule[3]):
+        return False, False
+    centred = 0 <= x < view[16] and 0 <= y < view[17]
+    hit = centred and _pixel(x, y, table) if rule[4] else _is_hit(x, y, xx, xy, yy, rule, table)
+    return centred or hit, hit
+
+
+@kernel(parallel=True)
+def _vote(means, covariance, visible, view, table, depth, rule, hits, views):
+    """Add one camera's opinion: `views` [N] grows where it sees a Gaussian, `hits` [N] where its mask is hit too."""
+    count = len(means)
+    for chunk in prange(CHUNKS):
+        for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
+            if visible[i]:
+                seen, hit = _opinion(means, covariance, view, table, depth, rule, i)
+                views[i] += seen
+                hits[i] += hit
+
+
+@kernel(parallel=True)
+def _touch(means, covariance, visible, reach, view, tiles):
+    """Set the tiles, bool [rows, columns], that hold a pixel of an ellipse of `reach` [N] standard deviations."""
+    width, height = int(view[16]), int(view[17])
+    for chunk in prange(CHUNKS):
+        for i in range(len(means) * chunk // CHUNKS, len(means) * (chunk + 1) // CHUNKS):
+            if not visible[i]:
+                continue
+            x, y, z, xx, xy, yy = _project(means, covariance, view, i)
+            if not (z > 0 and xx * yy - xy * xy > 0 and abs(x) < 1e9 and abs(y) < 1e9):
+                continue
+            first, end = _rows(y, yy, reach[i], 1e9, height)
+            for row in range(first, end):
+                left, right = _row_span(x, y, xx, xy, yy, reach[i] * reach[i], 1e9, width, row)
+                # Threads may set the same tile; all of them write the same value.
+                for column in range(left // TILE, (right + TILE - 1) // TILE if right > left else 0):
+                    tiles[row // TILE, column] = True

@@ -1,0 +1,139 @@
+"""Where the scene is, and the Gaussians a fit begins with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import prange
+
+from packuv.camera import PinholeCamera
+from packuv.fit.start.bounds import Bounds
+from packuv.fit.start.points import Points, no_points, seen_colours
+from packuv.gaussians.codes import OPACITY_RANGE
+from packuv.gaussians.floats import Gaussians
+from packuv.kernels.compile import kernel
+
+SH_BASE = 0.28209479177387814
+"""Value of the constant spherical harmonic"""
+
+_ROUNDS = 8
+"""Draws of random places before fewer than asked for will do"""
+
+
+@dataclass(frozen=True)
+class StartOptions:
+    count: int = 22_000
+    """Gaussians at the start"""
+    volume: float = 1.25
+    """Random Gaussians fill a ball of this many radii about the centre"""
+    min_views: int = 3
+    """Cameras that must see a random Gaussian; all of them in smaller rigs"""
+    surface_share: float = 0.45
+    """At most this share starts on places that cameras agree on: triangulated points and sure places of the shell"""
+    shell_share: float = 0.3
+    """This share covers the rest of the shell evenly; what is left fills the volume"""
+    opacity: float = 0.1
+    """Opacity of every Gaussian at the start"""
+
+
+def first_gaussians(
+    cameras: Sequence[PinholeCamera],
+    pictures: Sequence[np.ndarray],  # float32 [3, H, W] in [0, 1]
+    *,
+    bounds: Bounds,
+    surface: Points | None,
+    options: StartOptions,
+    sh_degree: int,
+    seed: int,
+) -> Gaussians:
+    """Gaussians on the points of the surface and at random in the volume that several cameras see, `options.count`
+    together, coloured by the pictures.
+
+    Raises ValueError if no place is seen by enough cameras.
+    """
+    rng = np.random.default_rng(seed)
+    surface = no_points() if surface is None else surface
+    volume = _random_points(cameras, pictures, bounds, options, max(0, options.count - len(surface.xyz)), rng)
+    xyz, rgb = (np.concatenate([getattr(surface, name), getattr(volume, name)]) for name in ("xyz", "rgb"))
+    spacing = neighbour_distance(xyz.astype(np.float32))
+    scale = np.clip(spacing, 1e-4 * bounds.radius, 2 * np.median(spacing))
+    return round_gaussians(xyz, rgb, scale, opacity=options.opacity, sh_degree=sh_degree)
+
+
+def round_gaussians(
+    xyz: np.ndarray, rgb: np.ndarray, scale: np.ndarray, *, opacity: float, sh_degree: int
+) -> Gaussians:
+    """Spheres at `xyz` [N, 3] with colours [N, 3] in [0, 1] and standard deviations [N], world."""
+    count = len(xyz)
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = (rgb - 0.5) / SH_BASE
+    return Gaussians(
+        means=xyz.astype(np.float32),
+        log_scales=np.repeat(np.log(scale)[:, None], 3, axis=1).astype(np.float32),
+        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        opacity_logits=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
+        sh=sh,
+    )
+
+
+def empty_gaussians(count: int, bounds: Bounds, *, sh_degree: int) -> Gaussians:
+    """Rows at the scene's centre that no renderer draws: place for what comes later."""
+    centre, size = np.repeat(bounds.centre[None], count, axis=0), max(0.01 * bounds.radius, 1e-12)
+    rows = round_gaussians(centre, np.full((count, 3), 0.5), np.full(count, size), opacity=0.5, sh_degree=sh_degree)
+    return replace(rows, opacity_logits=np.full(count, OPACITY_RANGE[0], np.float32))
+
+
+def _random_points(
+    cameras: Sequence[PinholeCamera],
+    pictures: Sequence[np.ndarray],
+    bounds: Bounds,
+    options: StartOptions,
+    count: int,
+    rng: np.random.Generator,
+) -> Points:
+    needed = min(options.min_views, len(cameras))
+    xyz, rgb = np.empty((0, 3)), np.empty((0, 3))
+    for _ in range(_ROUNDS if count else 0):
+        places = random_ball(rng, 4 * count) * options.volume * bounds.radius + bounds.centre
+        colours, views = seen_colours(cameras, pictures, places, bounds.near)
+        seen = views >= needed
+        xyz, rgb = np.concatenate([xyz, places[seen]]), np.concatenate([rgb, colours[seen]])
+        if len(xyz) >= count:
+            break
+    if count and not len(xyz):
+        raise ValueError(
+            f"no place within {options.volume} rig radii is seen by {needed} cameras; check the calibration: "
+            "do the cameras look at a common volume?"
+        )
+    return Points(xyz[:count], rgb[:count])
+
+
+def random_ball(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Points evenly spread in the unit ball, float64 [count, 3]."""
+    direction = rng.standard_normal((count, 3))
+    return direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(rng.random((count, 1)))
+
+
+@kernel(parallel=True)
+def neighbour_distance(points):
+    """Mean distance to the three nearest other points, float32 [N]; every pair is looked at, O(N^2)."""
+    count = len(points)
+    out = np.empty(count, np.float32)
+    for row in prange(count):
+        i = np.int64(row)
+        a = b = c = np.float32(np.inf)
+        for j in range(count):
+            x, y, z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+            d = x * x + y * y + z * z
+            if j == i or d >= c:
+                continue
+            if d < a:
+                a, b, c = d, a, b
+            elif d < b:
+                b, c = d, b
+            else:
+                c = d
+        out[i] = (np.sqrt(a) + np.sqrt(b) + np.sqrt(c)) / np.float32(3) if c < np.inf else np.float32(1e-3)
+    return out

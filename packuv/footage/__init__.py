@@ -1,0 +1,1 @@
+"""Pictures of a capture: decoded on demand, undistorted and balanced in colour."""

@@ -1,0 +1,122 @@
+"""What a camera's lens and sensor do to a picture, and how that is undone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from packuv.camera import PinholeCamera
+
+DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+"""Coefficient counts that OpenCV's lens model knows, see `LensCamera.distortion`."""
+
+
+@dataclass(frozen=True)
+class LensCamera:
+    """A camera as it films: its pinhole, the lens in front of it, and its colours."""
+
+    pinhole: PinholeCamera
+    """Intrinsics and pose in the video's own pixels; the name is the key of its video"""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; empty for a pinhole camera"""
+    gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Linear-light factors r g b that bring this camera to the rig's common colour"""
+
+    def __post_init__(self) -> None:
+        if len(self.distortion) not in DISTORTION_LENGTHS:
+            raise ValueError(
+                f"camera {self.pinhole.name!r}: a lens has one of {DISTORTION_LENGTHS} coefficients, "
+                f"not {len(self.distortion)}"
+            )
+        if len(self.gains) != 3 or not all(np.isfinite(gain) and gain > 0 for gain in self.gains):
+            raise ValueError(f"camera {self.pinhole.name!r}: gains must be three positive numbers, not {self.gains}")
+
+    def to_json(self) -> dict[str, Any]:
+        # All floats, so that a round trip through JSON gives the same text: caches compare by it.
+        floats = {key: float(getattr(self.pinhole, key)) for key in ("fx", "fy", "cx", "cy")}
+        lens = {"distortion": [float(k) for k in self.distortion], "gains": [float(gain) for gain in self.gains]}
+        return {**self.pinhole.to_json(), **floats, **lens}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> LensCamera:
+        red, green, blue = data["gains"]
+        return cls(PinholeCamera.from_json(data), tuple(data["distortion"]), (red, green, blue))
+
+
+def gain_table(gains: tuple[float, float, float]) -> np.ndarray:
+    """float32 [3, 256]: sRGB in [0, 1] of each 8-bit sRGB value times a gain in linear light."""
+    value = np.arange(256) / 255
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    scaled = np.clip(linear * np.asarray(gains)[:, None], 0, 1)  # [3, 256]
+    encoded = np.where(scaled <= 0.0031308, scaled * 12.92, 1.055 * scaled ** (1 / 2.4) - 0.055)
+    return np.clip(encoded, 0, 1).astype(np.float32)
+
+
+def undistorted_camera(lens: LensCamera) -> PinholeCamera:
+    """The widest pinhole camera with this centre and picture size that shows only what the lens filmed.
+
+    Raises ValueError for coefficients that fold the picture over itself.
+    """
+    if not any(lens.distortion):
+        return lens.pinhole
+    zooms = np.geomspace(4, 1 / 4, 81)
+    valid = [_covered(lens, zoom) for zoom in zooms]
+    if not valid[0]:
+        raise ValueError(
+            f"camera {lens.pinhole.name!r}: lens coefficients {lens.distortion} do not map the picture one to one, "
+            "not even at its centre; check the calibration"
+        )
+    good = zooms[valid.index(False) - 1] if False in valid else zooms[-1]
+    low = good * zooms[1] / zooms[0]
+    for _ in range(12):
+        middle = (low * good) ** 0.5
+        low, good = (low, middle) if _covered(lens, middle) else (middle, good)
+    return _zoomed(lens.pinhole, good)
+
+
+def _zoomed(camera: PinholeCamera, zoom: float) -> PinholeCamera:
+    return PinholeCamera(
+        camera.name, camera.width, camera.height, camera.fx * zoom, camera.fy * zoom, camera.cx, camera.cy,
+        camera.camera_from_world,
+    )  # fmt: skip
+
+
+def _covered(lens: LensCamera, zoom: float) -> bool:
+    """Whether rays through the border of the zoomed picture land inside the filmed one, without a fold on the way."""
+    camera = lens.pinhole
+    across, down = np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33)
+    border = np.concatenate(
+        [np.stack(np.broadcast_arrays(across, y), axis=1) for y in (0, camera.height)]
+        + [np.stack(np.broadcast_arrays(x, down), axis=1) for x in (0, camera.width)]
+    )  # [132, 2], pixels
+    rays = (border - [camera.cx, camera.cy]) / [camera.fx * zoom, camera.fy * zoom]
+    # From the centre outwards; the short last step catches a fold right at the border.
+    steps = np.append(np.linspace(0, 1, 33)[1:-1], [0.999, 1])[:, None, None] * rays  # [33, 132, 2]
+    filmed = _filmed(lens, steps.reshape(-1, 2)).reshape(steps.shape)
+    radius = np.linalg.norm(filmed - [camera.cx, camera.cy], axis=2)
+    inside = (filmed >= 0) & (filmed <= [camera.width, camera.height])
+    return bool(inside.all() and (np.diff(radius, axis=0) > 0).all())
+
+
+def _filmed(lens: LensCamera, rays: np.ndarray) -> np.ndarray:
+    """Pixels, float64 [n, 2], where a lens shows rays [n, 2], given at depth 1."""
+    points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.pinhole.matrix, np.array(lens.distortion))
+    return pixels.reshape(-1, 2)
+
+
+def undistortion_maps(lens: LensCamera, camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray] | None:
+    """Fixed-point maps for cv2.remap from the filmed picture to the pinhole one; None for a pinhole lens."""
+    if not any(lens.distortion):
+        return None
+    # OpenCV puts the centre of the first pixel at 0, we put it at 0.5.
+    shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    size = (camera.width, camera.height)
+    maps = cv2.initUndistortRectifyMap(
+        lens.pinhole.matrix - shift, np.array(lens.distortion), np.eye(3), camera.matrix - shift, size, cv2.CV_16SC2
+    )
+    return maps[0], maps[1]

@@ -1,0 +1,167 @@
+"""Pictures on demand: exact decoding per camera, and the undistorted, colour-balanced views that a fit sees.
+
+Nothing is written to disk. A picture that differs from the one asked for is never returned: every decoded frame
+must carry the timestamp that the container's packets give to that frame number.
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from packuv.camera import PinholeCamera
+from packuv.footage.lens import LensCamera, gain_table, undistorted_camera, undistortion_maps
+from packuv.footage.reader import FrameReader
+
+if TYPE_CHECKING:
+    pass
+
+
+class Views:
+    """What a fit and an evaluation see: undistorted, colour-balanced pictures by camera and instant.
+
+    A camera is an index into `cameras`, an instant a row of `frames`. Pictures of the last instants stay in memory
+    as bytes, up to `cache_bytes`; reading instants in ascending order decodes every frame once.
+    """
+
+    cameras: tuple[PinholeCamera, ...]
+    """The undistorted cameras, at the size of the pictures"""
+
+    def __init__(
+        self,
+        videos: Mapping[str, Path],
+        frames: np.ndarray,
+        lenses: Sequence[LensCamera],
+        *,
+        max_width: int | None = None,
+        cache_bytes: int = 1 << 30,
+        reader: FrameReader | None = None,
+    ) -> None:
+        """`frames` is int [T, C]: frame number in the video of camera c at instant t, -1 where it has none.
+
+        Pictures wider than `max_width` are scaled down to it. `reader` is shared with others if given.
+        Raises ValueError where shapes disagree, a camera has no video, or a lens cannot be undistorted.
+        """
+        names = [lens.pinhole.name for lens in lenses]
+        if frames.ndim != 2 or frames.shape[1] != len(lenses) or not len(lenses):
+            raise ValueError(f"frames must be [T, C] with C = {len(lenses)} cameras, but are {frames.shape}")
+        if missing := sorted(set(names) - set(videos)):
+            raise ValueError(f"cameras {missing} have no video; there are videos of {sorted(videos)}")
+        self.lenses = tuple(lenses)
+        self.frames = frames.astype(np.int32)
+        self.max_width = max_width
+        self.reader = reader or FrameReader({name: Path(videos[name]) for name in names})
+        self._videos = {name: Path(videos[name]) for name in names}
+        undistorted = [undistorted_camera(lens) for lens in lenses]
+        self._maps = [undistortion_maps(lens, camera) for lens, camera in zip(lenses, undistorted, strict=True)]
+        self.cameras = tuple(_limited(camera, max_width) for camera in undistorted)
+        self._tables = [gain_table(lens.gains) for lens in lenses]
+        self._cache: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
+        self._cache_bytes = cache_bytes
+        self._cached_bytes = 0
+        self._guard = Lock()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(camera.name for camera in self.cameras)
+
+    def __len__(self) -> int:
+        """Number of instants, T."""
+        return len(self.frames)
+
+    def picture(self, camera: int, instant: int) -> np.ndarray | None:
+        """Colour-balanced picture, float32 [3, H, W] in [0, 1], or None where the camera has no frame."""
+        pixels = self.pixels(camera, instant)
+        return None if pixels is None else self.balanced(camera, pixels)
+
+    def balanced(self, camera: int, pixels: np.ndarray) -> np.ndarray:
+        """Pixels of a camera, uint8 [H, W, 3], in the rig's common colour: float32 [3, H, W] in [0, 1]."""
+        picture = np.empty((3, *pixels.shape[:2]), dtype=np.float32)
+        for channel, table in enumerate(self._tables[camera]):
+            picture[channel] = cv2.LUT(cv2.extractChannel(pixels, channel), table)
+        return picture
+
+    def pixels(self, camera: int, instant: int, *, remember: bool = True) -> np.ndarray | None:
+        """Undistorted picture in the camera's own colours, uint8 [H, W, 3], read-only, or None."""
+        frame = int(self.frames[instant, camera])
+        if frame < 0:
+            return None
+        key = (camera, frame)
+        with self._guard:
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+        pixels = self._undistorted(camera, frame)
+        pixels.setflags(write=False)
+        if remember:
+            self._remember(key, pixels)
+        return pixels
+
+    def to_spec(self) -> dict[str, Any]:
+        """Everything `from_spec` needs to build these views in another process, as JSON."""
+        return {
+            "videos": {name: str(path.resolve()) for name, path in self._videos.items()},
+            "cameras": [lens.to_json() for lens in self.lenses],
+            "frames": _packed(self.frames),
+            "max_width": self.max_width,
+        }
+
+    @classmethod
+    def from_spec(cls, spec: Mapping[str, Any]) -> Views:
+        """Inverse of `to_spec`."""
+        lenses = [LensCamera.from_json(item) for item in spec["cameras"]]
+        frames = _unpacked(spec["frames"], len(lenses))
+        videos = {name: Path(path) for name, path in spec["videos"].items()}
+        return cls(videos, frames, lenses, max_width=spec["max_width"])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Views.from_spec, (self.to_spec(),))
+
+    def _undistorted(self, camera: int, frame: int) -> np.ndarray:
+        lens, target = self.lenses[camera].pinhole, self.cameras[camera]
+        pixels = self.reader.read(lens.name, frame)
+        if pixels.shape[:2] != (lens.height, lens.width):
+            raise ValueError(
+                f"camera {lens.name!r}: the video is {pixels.shape[1]}x{pixels.shape[0]}, its calibration "
+                f"{lens.width}x{lens.height}; scale the calibration to the video"
+            )
+        if maps := self._maps[camera]:
+            pixels = cv2.remap(pixels, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        if target.width != lens.width:
+            pixels = cv2.resize(pixels, (target.width, target.height), interpolation=cv2.INTER_AREA)
+        return pixels
+
+    def _remember(self, key: tuple[int, int], pixels: np.ndarray) -> None:
+        with self._guard:
+            if key in self._cache:
+                return
+            self._cache[key] = pixels
+            self._cached_bytes += pixels.nbytes
+            while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
+                self._cached_bytes -= self._cache.popitem(last=False)[1].nbytes
+
+
+def _packed(frames: np.ndarray) -> str:
+    """Steps between instants, deflated: frame numbers mostly count by one, so hours fit into a line of JSON."""
+    steps = np.diff(frames, axis=0, prepend=np.zeros_like(frames[:1]))
+    return base64.b64encode(zlib.compress(steps.T.astype("<i4").tobytes(), 6)).decode()
+
+
+def _unpacked(text: str, cameras: int) -> np.ndarray:
+    """int32 [T, cameras]; the inverse of `_packed`."""
+    steps = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype="<i4").reshape(cameras, -1)
+    return np.cumsum(steps.T, axis=0, dtype=np.int32)
+
+
+def _limited(camera: PinholeCamera, max_width: int | None) -> PinholeCamera:
+    if max_width is None or camera.width <= max_width:
+        return camera
+    return camera.scaled(max_width, max(1, round(camera.height * max_width / camera.width)))

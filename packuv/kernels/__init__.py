@@ -1,0 +1,1 @@
+"""How kernels are compiled, and the SIMD lanes that they compute with."""

@@ -1,0 +1,1 @@
+"""What moves in the pictures: optical flow and masks, the background, keyframes."""

@@ -1,0 +1,85 @@
+"""What stands still: the temporal median of each camera's pictures.
+
+What moves hides other parts of the scene at every instant; over a sequence most of the rest is seen. A fit that knows
+it first paints no head onto the wall behind it, and has the wall that a step aside uncovers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from packuv.files import write_npz
+from packuv.footage.views import Views
+from packuv.progress import Progress, no_progress
+
+
+@dataclass(frozen=True)
+class BackgroundOptions:
+    instants: int = 15
+    """Evenly over the sequence, of which the median is taken; fewer than three leave no background"""
+    iteration_share: float = 0.4
+    """Share of the first keyframe's iterations that fit the background; 0 fits none"""
+    tolerance: int = 12
+    """Grey values of 255 from the median that noise and shadows explain"""
+    agreement: float = 0.6
+    """Share of the instants that must lie within the tolerance, or the place is unknown: somebody stood there"""
+
+    def __post_init__(self) -> None:
+        if self.instants < 0 or self.tolerance < 0 or not (0 <= self.iteration_share < 1 and 0 < self.agreement <= 1):
+            raise ValueError(
+                "instants and tolerance must not be negative, iteration_share must lie in [0, 1) and agreement in "
+                f"(0, 1], but they are {self.instants}, {self.tolerance}, {self.iteration_share} and {self.agreement}"
+            )
+
+
+@dataclass(frozen=True)
+class Still:
+    """The background of one camera."""
+
+    camera: int
+    """Index into the views' cameras"""
+    pixels: np.ndarray
+    """uint8 [H, W, 3], in the camera's own colours"""
+    known: np.ndarray
+    """bool [H, W]: most instants agree on it"""
+
+
+def find_background(views: Views, options: BackgroundOptions, progress: Progress = no_progress) -> list[Still]:
+    """Backgrounds of the cameras that filmed at least three of the chosen instants."""
+    instants = np.unique(np.linspace(0, len(views) - 1, min(options.instants, len(views))).round().astype(int))
+    stills = []
+    for camera in range(len(views.cameras)):
+        pictures = [views.pixels(camera, int(instant), remember=False) for instant in instants]
+        found = [picture for picture in pictures if picture is not None]
+        if len(found) >= 3:
+            stills.append(_still(camera, np.stack(found), options))
+        progress(camera + 1, len(views.cameras))
+    return stills
+
+
+def save_stills(path: Path, stills: Sequence[Still]) -> None:
+    """Write one .npz with all backgrounds."""
+    arrays = {f"{name}_{still.camera}": getattr(still, name) for still in stills for name in ("pixels", "known")}
+    write_npz(path, {"cameras": np.array([still.camera for still in stills], np.int64), **arrays})
+
+
+def load_stills(path: Path) -> list[Still]:
+    """What `save_stills` wrote."""
+    with np.load(path) as data:
+        return [Still(int(c), data[f"pixels_{c}"], data[f"known_{c}"]) for c in data["cameras"]]
+
+
+def _still(camera: int, pictures: np.ndarray, options: BackgroundOptions) -> Still:
+    """`pictures` is uint8 [n, H, W, 3]."""
+    middle = len(pictures) // 2
+    median = np.partition(pictures, middle, axis=0)[middle]
+    needed = options.agreement * len(pictures)
+    near = np.zeros(median.shape[:2], np.int32)
+    for picture in pictures:
+        difference = np.maximum(picture, median) - np.minimum(picture, median)
+        near += (difference <= options.tolerance).all(axis=2)
+    return Still(camera, median, near >= needed)

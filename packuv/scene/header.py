@@ -1,0 +1,294 @@
+"""What a scene file says about its pictures: the header that travels as the attachment packuv.json.
+
+docs/scene-format.md specifies it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from packuv.camera import PinholeCamera
+from packuv.gaussians.codes import Codes, Quantizer
+from packuv.scene.matroska import Track
+from packuv.scene.mosaic import BLOCK, Mosaic
+from packuv.scene.stream import REPEAT, Tolerance, channel_names
+
+FORMAT, VERSION, LAYOUT = "packuv-scene", 2, "compact"
+HEADER, CHECKSUM = "packuv.json", "packuv.sha256"
+"""Names of the two attachments; the second lets `sha256sum -c` check the first."""
+KEY, DYNAMIC = 0, 1
+"""Track numbers."""
+TRACK_NAMES = ("key", "dynamic")
+FLAG_NAMES = ("kept", "changed")
+"""Names of the tracks' planes of flags."""
+
+
+@dataclass(frozen=True)
+class SceneHeader:
+    """What a scene says about itself, besides its pictures."""
+
+    quantizer: Quantizer
+    times_ns: np.ndarray
+    """int64 [T]: when each frame was filmed, on the capture's clock; frames are at least 1 ms apart"""
+    rate: Fraction
+    """Nominal frames per second"""
+    cameras: tuple[PinholeCamera, ...] = ()
+    held_out: tuple[str, ...] = ()
+    """Names of the cameras that were not fitted"""
+    sync: Mapping[str, Any] = field(default_factory=dict)
+    """Summary of the synchronization, JSON"""
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    """Whatever else should travel along, JSON; programs ignore what they do not know"""
+
+    def __post_init__(self) -> None:
+        if self.times_ns.dtype != np.int64 or self.times_ns.ndim != 1:
+            raise ValueError(f"frame times must be int64 [T], but are {self.times_ns.dtype} {self.times_ns.shape}")
+        if not self.rate > 0:
+            raise ValueError(f"the frame rate must be positive, but is {self.rate}")
+        unknown = set(self.held_out) - {camera.name for camera in self.cameras}
+        if unknown:
+            raise ValueError(f"held-out cameras {sorted(unknown)} are not among the scene's cameras")
+        try:
+            json.dumps([dict(self.sync), dict(self.extra)], allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"sync and extra must be plain JSON: {error}") from None
+        if (np.diff(self.times_ms) < 1).any():
+            first = int(np.argmin(np.diff(self.times_ms) >= 1))
+            raise ValueError(
+                f"frames {first} and {first + 1} are {np.diff(self.times_ns)[first]} ns apart; "
+                "a scene file needs rising times at least 1 ms apart"
+            )
+
+    @property
+    def times_ms(self) -> np.ndarray:
+        """Presentation times in the file, int64 [T]: milliseconds after the first frame."""
+        return (self.times_ns - self.times_ns[:1] + 500_000) // 1_000_000
+
+    def first(self, frames: int) -> SceneHeader:
+        """The header of a scene that ends after so many frames."""
+        return replace(self, times_ns=self.times_ns[:frames])
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "quantizer": self.quantizer.to_json(),
+            "times_ns": self.times_ns.tolist(),
+            "rate": f"{self.rate.numerator}/{self.rate.denominator}",
+            "cameras": [camera.to_json() for camera in self.cameras],
+            "held_out": list(self.held_out),
+            "sync": dict(self.sync),
+            "extra": dict(self.extra),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> SceneHeader:
+        return cls(
+            Quantizer.from_json(data["quantizer"]),
+            np.asarray(data["times_ns"], dtype=np.int64),
+            Fraction(data["rate"]),
+            tuple(PinholeCamera.from_json(camera) for camera in data["cameras"]),
+            tuple(data["held_out"]),
+            data["sync"],
+            data["extra"],
+        )
+
+
+@dataclass(frozen=True)
+class SegmentEntry:
+    """Where a segment lies in the scene, and how its frames are stored."""
+
+    first: int
+    """Scene frame of its key"""
+    frames: int
+    rows: int
+    """Number of Gaussians, N"""
+    dynamic: int
+    """Number of rows that may change, D: the first ones"""
+    reference: int | None
+    """Earlier segment from whose key it takes rows"""
+    own: int
+    """Number of rows that its own key picture holds"""
+    own_dynamic: int
+    """Of these, how many may change: the first ones"""
+    first_packet: int
+    """Number of its first packet in the dynamic track; its key is packet s of the key track, s being its own number"""
+    predictions: tuple[int, ...]
+    """Of each frame after the key: REPEAT (no packet), PREVIOUS or LINEAR"""
+    differences: tuple[int, ...]
+    """Of each frame after the key: 1 where colour residuals are stored as differences to green"""
+
+    def packet(self, step: int) -> int:
+        """Packet of the frame `step` frames after the key; meaningless for REPEAT."""
+        return self.first_packet + sum(p != REPEAT for p in self.predictions[: step - 1])
+
+
+@dataclass(frozen=True)
+class TrackEntry:
+    """A track's picture layout, and what its packets must be."""
+
+    mosaic: Mosaic
+    constants: np.ndarray
+    """uint8 [channels]: the value of every row in channels without a plane"""
+    slices: int
+    """Of a picture in FFV1"""
+    sizes: tuple[int, ...] = ()
+    """Bytes of each packet"""
+    crc32: tuple[int, ...] = ()
+    """CRC-32 (zlib's) of each packet; FFmpeg reports no failed slice checksum to its caller"""
+
+    def video(self, number: int) -> Track:
+        return Track(TRACK_NAMES[number], self.mosaic.width, self.mosaic.height, self.slices)
+
+    def to_json(self, number: int, names: Sequence[str]) -> dict[str, Any]:
+        mosaic = self.mosaic
+        missing = set(range(mosaic.channel_count)) - set(mosaic.channels)
+        flags = [FLAG_NAMES[number]] if mosaic.flagged else []
+        return {
+            "name": TRACK_NAMES[number],
+            "width": mosaic.width,
+            "height": mosaic.height,
+            "planes": [names[channel] for channel in mosaic.channels] + flags,
+            "planes_across": mosaic.grid[0],
+            "block": BLOCK,
+            "blocks_across": mosaic.blocks_across,
+            "blocks_down": mosaic.blocks_down,
+            "constants": {names[channel]: int(self.constants[channel]) for channel in sorted(missing)},
+            "slices": self.slices,
+            "sizes": list(self.sizes),
+            "crc32": list(self.crc32),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any], names: Sequence[str]) -> TrackEntry:
+        constants = np.zeros(len(names), np.uint8)
+        for name, value in data["constants"].items():
+            constants[names.index(name)] = value
+        planes = list(data["planes"])
+        flagged = bool(planes) and planes[-1] in FLAG_NAMES
+        channels = tuple(names.index(name) for name in planes[: len(planes) - flagged])
+        mosaic = Mosaic(channels, len(names), int(data["blocks_across"]), int(data["blocks_down"]), flagged)
+        stated = data["width"], data["height"], data["planes_across"], data["block"]
+        if (mosaic.width, mosaic.height, mosaic.grid[0], BLOCK) != stated:
+            raise ValueError(f"track {data['name']!r} has an unknown picture layout")
+        if set(data["constants"]) != {names[k] for k in set(range(len(names))) - set(channels)}:
+            raise ValueError(f"track {data['name']!r} must give every channel either a plane or a constant")
+        lists = tuple(data["sizes"]), tuple(data["crc32"])
+        return cls(mosaic, constants, int(data["slices"]), *lists)
+
+
+@dataclass(frozen=True)
+class SceneIndex:
+    """All that packuv.json holds."""
+
+    header: SceneHeader
+    tolerance: Tolerance
+    """By how much frames after a key may differ from what was fitted"""
+    tracks: tuple[TrackEntry, ...]
+    """The key track and, if anything ever changes, the dynamic track"""
+    segments: tuple[SegmentEntry, ...]
+    digests: tuple[str, ...]
+    """`digest` of each frame's codes"""
+    tools: Mapping[str, str]
+    """Versions of the programs that wrote the file"""
+
+    def __post_init__(self) -> None:
+        frames = sum(segment.frames for segment in self.segments)
+        if not frames == len(self.header.times_ns) == len(self.digests) or not self.tracks:
+            raise ValueError(
+                f"{frames} frames in segments, {len(self.header.times_ns)} times, {len(self.digests)} digests, "
+                f"{len(self.tracks)} tracks do not belong together"
+            )
+        first = 0
+        for number, segment in enumerate(self.segments):
+            if segment.first != first or not self._fits(number, segment):
+                raise ValueError(f"the segment at frame {segment.first} does not fit the scene's tracks")
+            first += segment.frames
+
+    def _fits(self, number: int, segment: SegmentEntry) -> bool:
+        key, mosaic = self.tracks[KEY], self.tracks[KEY].mosaic
+        after_key = len(segment.predictions) == len(segment.differences) == segment.frames - 1
+        counts = 0 <= segment.dynamic <= segment.rows and 0 <= segment.own_dynamic <= segment.own <= segment.rows
+        if segment.reference is None:
+            complete = (segment.own, segment.own_dynamic) == (segment.rows, segment.dynamic)
+        else:
+            earlier = 0 <= segment.reference < number
+            complete = earlier and mosaic.flagged and self.segments[segment.reference].rows <= mosaic.capacity
+        stored = number < len(key.crc32) == len(key.sizes) and segment.own <= mosaic.capacity
+        return after_key and counts and complete and stored and self._fits_dynamic(segment)
+
+    def _fits_dynamic(self, segment: SegmentEntry) -> bool:
+        if len(self.tracks) == 1:
+            return not set(segment.predictions) - {REPEAT}
+        track = self.tracks[DYNAMIC]
+        packets = segment.first_packet >= 0 and segment.packet(segment.frames) <= len(track.crc32) == len(track.sizes)
+        return packets and track.mosaic.flagged and segment.dynamic <= track.mosaic.capacity
+
+    def to_json(self) -> dict[str, Any]:
+        names = channel_names(self.header.quantizer.sh_degree)
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "layout": LAYOUT,
+            "tolerance": vars(self.tolerance),
+            "channels": list(names),
+            "tracks": [entry.to_json(number, names) for number, entry in enumerate(self.tracks)],
+            "segments": [vars(segment) for segment in self.segments],
+            "digests": list(self.digests),
+            "tools": dict(self.tools),
+            **self.header.to_json(),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> SceneIndex:
+        if data["format"] != FORMAT or data["version"] != VERSION or data["layout"] != LAYOUT:
+            raise ValueError(
+                f"it is {data['format']} version {data['version']}, layout {data['layout']}; this program reads "
+                f"{FORMAT} version {VERSION}, layout {LAYOUT}"
+            )
+        names = list(channel_names(int(data["quantizer"]["sh_degree"])))
+        known = {item.name for item in fields(SegmentEntry)}
+        segments = [{name: value for name, value in s.items() if name in known} for s in data["segments"]]
+        lists = ("predictions", "differences")
+        return cls(
+            SceneHeader.from_json(data),
+            Tolerance(data["tolerance"]["position"], data["tolerance"]["attribute"]),
+            tuple(TrackEntry.from_json(track, names) for track in data["tracks"]),
+            tuple(SegmentEntry(**{**s, **{name: tuple(s[name]) for name in lists}}) for s in segments),
+            tuple(data["digests"]),
+            data["tools"],
+        )
+
+    def encode(self) -> dict[str, tuple[str, bytes]]:
+        """The attachments of the file: name -> MIME type, content."""
+        document = json.dumps(self.to_json(), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+        checksum = f"{hashlib.sha256(document).hexdigest()}  {HEADER}\n".encode()
+        return {HEADER: ("application/json", document), CHECKSUM: ("text/plain", checksum)}
+
+    @classmethod
+    def decode(cls, attachments: Mapping[str, bytes]) -> SceneIndex:
+        """The inverse of `encode`; raises ValueError for attachments that are missing, damaged or make no sense."""
+        for name in (HEADER, CHECKSUM):
+            if name not in attachments:
+                raise ValueError(f"it is not a whole PackUV scene, it lacks the attachment {name}")
+        document = attachments[HEADER]
+        if attachments[CHECKSUM].decode(errors="replace").split() != [hashlib.sha256(document).hexdigest(), HEADER]:
+            raise ValueError(f"its header {HEADER} is damaged, it does not match {CHECKSUM}")
+        try:
+            return cls.from_json(json.loads(document))
+        except (KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
+            raise ValueError(f"its header {HEADER} lacks or misuses a field ({error!r})") from None
+        except ValueError as error:
+            raise ValueError(f"its header {HEADER} cannot be read: {error}") from None
+
+
+def digest(codes: Codes) -> str:
+    """BLAKE2b of 16 bytes, in hex, over the positions (little-endian, row by row), then the attributes."""
+    hasher = hashlib.blake2b(np.ascontiguousarray(codes.xyz, dtype="<u2").data, digest_size=16)
+    hasher.update(np.ascontiguousarray(codes.attributes).data)
+    return hasher.hexdigest()

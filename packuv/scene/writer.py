@@ -1,0 +1,79 @@
+"""Write a scene file."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from packuv.gaussians.segment import Segment
+from packuv.progress import Progress, no_progress, part_of
+from packuv.scene.encoder import EncodeOptions, SceneEncoder, survey
+from packuv.scene.header import SceneHeader
+from packuv.scene.matroska import Spool, write_matroska
+from packuv.scene.verify import verify_scene
+
+
+@dataclass(frozen=True)
+class SceneSummary:
+    """What `write_scene` wrote."""
+
+    frames: int
+    bytes: int
+    """Size of the file"""
+    track_bytes: Mapping[str, int]
+    """Sum of the packets of each track"""
+    digests: tuple[str, ...]
+
+
+def write_scene(
+    path: Path,
+    segments: Sequence[Path],
+    header: SceneHeader,
+    *,
+    options: EncodeOptions | None = None,
+    threads: int = 0,
+    progress: Progress = no_progress,
+) -> SceneSummary:
+    """Encode segment files, in order, into one scene file, and read all of it back before it gets its name.
+
+    Segments that are not fitted yet may be left off at the end, with `header.first(frames)`: the file then ends early.
+    One segment at a time is in memory. Raises ValueError when the segments do not follow one another or do not match
+    the header, RuntimeError when the file does not decode to what was written.
+    """
+    path, options = Path(path), options or EncodeOptions()
+    found = survey(segments, header, options)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    steps = 2 * len(header.times_ns)
+    try:
+        with tempfile.TemporaryFile(dir=path.parent) as file:
+            spool = Spool(file)
+            with SceneEncoder(header, found, spool, options.tolerance, threads=threads) as encoder:
+                for segment in segments:
+                    encoder.add(Segment.load(segment), lambda done: progress(done, steps))
+                index = encoder.finish()
+            videos = [entry.video(number) for number, entry in enumerate(index.tracks)]
+            write_matroska(partial, videos, spool, index.encode(), rate=header.rate)
+        check = verify_scene(partial, threads=threads, progress=part_of(progress, steps // 2, steps))
+        if not check.ok:
+            raise RuntimeError(f"the scene was written but does not read back: {check.problem}")
+        _publish(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    track_bytes = {video.name: sum(entry.sizes) for video, entry in zip(videos, index.tracks, strict=True)}
+    return SceneSummary(len(index.digests), path.stat().st_size, track_bytes, index.digests)
+
+
+def _publish(partial: Path, path: Path) -> None:
+    """Give the file its name in one step, after its bytes are on the disk."""
+    for target in (partial, None, path.parent):
+        if target is None:
+            os.replace(partial, path)
+            continue
+        descriptor = os.open(target, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

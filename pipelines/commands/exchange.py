@@ -1,0 +1,260 @@
+"""Scenes to other programs and back: `packuv export`, `import`, `atlas` and `web`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.commands.terminal import print_facts, shown, size_text
+
+if TYPE_CHECKING:
+    from calibration.rig import Rig
+    from packuv.gaussians.uvmap import UvOptions
+    from packuv.interchange import SplatFormat
+    from packuv.scene import Scene
+
+
+# Frames
+
+
+def export_frames(arguments: argparse.Namespace) -> int:
+    """`packuv export SCENE`: one frame as a file, or several as a folder of files, of another program."""
+    from packuv.files import whole_folder
+    from packuv.interchange import write_gaussians
+    from packuv.scene import open_scene
+
+    kind = _splat_format(arguments.format, arguments.output)
+    with open_scene(arguments.scene) as scene:
+        if arguments.frame is not None:
+            _check_frame(arguments.frame, len(scene))
+            count = write_gaussians(arguments.output, scene.gaussians(arguments.frame), kind=kind)
+            print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}")
+            return 0
+        frames = _frames(arguments.frames, len(scene))
+        with whole_folder(arguments.output) as folder, shown(arguments, "export") as progress:
+            for done, frame in enumerate(frames, start=1):
+                write_gaussians(folder / f"{frame:06d}{kind.suffix}", scene.gaussians(frame), kind=kind)
+                progress(done, len(frames))
+    print(f"{arguments.output}: {len(frames)} files, frames {frames.start} to {frames.stop - 1}")
+    return 0
+
+
+def _splat_format(name: str | None, output: Path) -> SplatFormat:
+    """As asked for, or else by the file's name; a folder of frames gets standard PLY."""
+    from packuv.interchange import SplatFormat
+
+    if name:
+        return SplatFormat(name)
+    longest_first = sorted(SplatFormat, key=lambda kind: -len(kind.suffix))
+    found = [kind for kind in longest_first if output.name.lower().endswith(kind.suffix)]
+    if not found and output.suffix:
+        raise ValueError(f"{output.name} does not tell its format; choose one with --format: {', '.join(SplatFormat)}")
+    return found[0] if found else SplatFormat.PLY
+
+
+def _check_frame(frame: int, count: int) -> None:
+    if not 0 <= frame < count:
+        raise ValueError(f"the scene has frames 0 to {count - 1}, but frame {frame} is asked for")
+
+
+def _frames(asked: tuple[int, int | None], count: int) -> range:
+    first, stop = asked[0], count if asked[1] is None else asked[1]
+    if not first < stop <= count:
+        raise ValueError(f"the scene has frames 0 to {count - 1}, but {first}:{stop} is asked for")
+    return range(first, stop)
+
+
+def import_splats(arguments: argparse.Namespace) -> int:
+    """`packuv import`: splat files, or an atlas video, become a scene file; the loss is told."""
+    if len(arguments.inputs) == 1 and arguments.inputs[0].suffix.lower() == ".mkv":
+        return _import_atlas(arguments)
+    return _import_frames(arguments)
+
+
+def _import_atlas(arguments: argparse.Namespace) -> int:
+    from packuv.atlas.restore import import_atlas
+
+    with shown(arguments, "import") as progress:
+        report = import_atlas(arguments.inputs[0], arguments.output, progress=progress)
+    print_facts({"file": str(arguments.output), **vars(report)}, arguments.json, _import_atlas_text)
+    return 0
+
+
+def _import_atlas_text(facts: Mapping[str, Any]) -> str:
+    changed, frames = facts["changed"], facts["frames"]
+    check = f"{changed} of {frames} frames are not" if changed else f"all {frames} frames are"
+    return (
+        f"{facts['file']}: {frames} frames, {facts['gaussians']:,} Gaussians, {size_text(facts['bytes'])}\n"
+        f"check      {check} the integers that the atlas was made from"
+    )
+
+
+def _import_frames(arguments: argparse.Namespace) -> int:
+    from packuv.interchange.adopt import AdoptOptions, adopt, find_frames
+
+    options = AdoptOptions(
+        uv=None if arguments.keep_all else _uv(arguments),
+        rate=arguments.fps,
+        segment_frames=arguments.segment,
+        sh_degree=arguments.sh_degree,
+    )
+    frames = find_frames(arguments.inputs)
+    with shown(arguments, "import") as progress:
+        report = adopt(frames, arguments.output, options=options, progress=progress)
+    facts = {"file": str(arguments.output), **report.to_json()}
+    print_facts(facts, arguments.json, _import_text)
+    return 0
+
+
+def _import_text(facts: Mapping[str, Any]) -> str:
+    segments = f"{facts['segments']} segment{'s' if facts['segments'] > 1 else ''}"
+    dropped = f"{facts['undrawn']:,} of {facts['gaussians']:,} are broken or too faint to be drawn"
+    lines = [
+        f"{facts['file']}: {facts['frames']} frames in {segments}, {size_text(facts['bytes'])}",
+        f"gaussians  {dropped}; the UV map has no texel for {facts['pruned']:,}",
+        f"kept       {facts['kept_share']:.1%} of what is drawn, {facts['kept_alpha_share']:.1%} of its alpha",
+    ]
+    if facts["psnr_db"]:
+        pruned, whole = (_decibels(facts[key]) for key in ("psnr_pruned_db", "psnr_db"))
+        lines.append(f"pictures   {whole} against the original; {pruned} by the UV map alone")
+    return "\n".join(lines)
+
+
+def _decibels(values: list[float | None]) -> str:
+    """Mean and worst; equal pictures have no PSNR."""
+    finite = [value for value in values if value is not None]
+    if not finite:
+        return "exact"
+    return f"{sum(finite) / len(finite):.1f} dB (worst view {min(finite):.1f})"
+
+
+# Cameras
+
+
+def export_cameras(arguments: argparse.Namespace) -> int:
+    """`packuv export cameras`: the scene's cameras for another program."""
+    from calibration.exporters import write_colmap, write_poses_bounds, write_transforms
+    from packuv.files import whole_folder
+    from packuv.scene import open_scene
+
+    with open_scene(arguments.scene) as scene:
+        rig = _rig(scene, str(arguments.scene))
+        with whole_folder(arguments.output) as folder:
+            if arguments.to == "colmap":
+                write_colmap(rig, folder)
+            elif arguments.to == "transforms":
+                write_transforms(rig, folder / "transforms.json")
+            else:
+                rig = rig.select(sorted(rig.names))
+                write_poses_bounds(rig, folder / "poses_bounds.npy", _depths(scene, rig))
+            names = ", ".join(sorted(path.name for path in folder.iterdir()))
+    print(f"{arguments.output}: {len(rig.cameras)} cameras in {names}")
+    return 0
+
+
+def _rig(scene: Scene, source: str) -> Rig:
+    """The cameras of a scene, which have no lens, as a rig."""
+    from calibration.rig import Camera, Rig
+
+    if not scene.header.cameras:
+        raise ValueError(f"{source} holds no cameras")
+    cameras = [
+        Camera(c.name, c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.camera_from_world) for c in scene.header.cameras
+    ]
+    return Rig(tuple(cameras), source)
+
+
+def _depths(scene: Scene, rig: Rig) -> Any:
+    """Near and far of what each camera sees of the first frame, float64 [C, 2]; 0.1 % at either end left out."""
+    import numpy as np
+
+    from packuv.gaussians.floats import drawn
+
+    means = drawn(scene.gaussians(0)).means.astype(np.float64)
+    rows = []
+    for camera in rig.cameras:
+        depth = camera.project(means)[1][camera.sees(means)]
+        if not len(depth):
+            raise ValueError(f"camera {camera.name!r} sees nothing of the first frame, so that its depths are unknown")
+        rows.append(np.quantile(depth, [0.001, 0.999]))
+    return np.stack(rows)
+
+
+# Atlas
+
+
+def atlas(arguments: argparse.Namespace) -> int:
+    """`packuv atlas`: the UV atlas of one frame as a picture for people."""
+    from packuv.atlas.picture import sheet, write_png
+    from packuv.scene import open_scene
+
+    with open_scene(arguments.scene) as scene:
+        _check_frame(arguments.frame, len(scene))
+        picture = sheet(scene, arguments.frame, options=_uv(arguments), triplet=arguments.triplet)
+    write_png(arguments.output, picture)
+    what = arguments.triplet or "all triplets"
+    print(f"{arguments.output}: {what} of frame {arguments.frame}, {picture.shape[1]}x{picture.shape[0]}")
+    return 0
+
+
+def export_atlas(arguments: argparse.Namespace) -> int:
+    """`packuv export atlas`: the atlas as an ordinary video."""
+    from packuv.atlas.video import AtlasCodec, AtlasVideoOptions
+    from packuv.atlas.video import export_atlas as write
+
+    options = AtlasVideoOptions(AtlasCodec(arguments.codec), arguments.crf, _uv(arguments))
+    with shown(arguments, "export") as progress:
+        summary = write(arguments.scene, arguments.output, options=options, progress=progress)
+    facts = {"file": str(arguments.output), "codec": arguments.codec, "crf": arguments.crf, "exact": summary.exact}
+    print_facts({**facts, **vars(summary)}, arguments.json, _atlas_text)
+    return 0
+
+
+def _atlas_text(facts: Mapping[str, Any]) -> str:
+    tracks = ", ".join(f"{name} {size_text(count)}" for name, count in facts["track_bytes"].items())
+    errors = ", ".join(f"{name} {value:.2f}" for name, value in facts["rms"].items())
+    share = facts["seated"] / max(1, facts["gaussians"])
+    return "\n".join(
+        [
+            f"{facts['file']}: {facts['frames']} frames of {facts['width']}x{facts['height']}, "
+            f"{size_text(facts['bytes'])}, {size_text(facts['bytes'] / facts['frames'])} a frame",
+            f"tracks     {tracks}",
+            f"gaussians  {share:.2%} of those drawn have a texel",
+            "check      decodes to exactly what was drawn" if facts["exact"] else f"error      rms in steps: {errors}",
+        ]
+    )
+
+
+def _uv(arguments: argparse.Namespace) -> UvOptions:
+    from packuv.gaussians.uvmap import UvOptions
+
+    return UvOptions(rows=arguments.map, columns=arguments.map, layers=arguments.layers)
+
+
+# Web
+
+
+def web(arguments: argparse.Namespace) -> int:
+    """`packuv web`: the scene as static files for any web server."""
+    from packuv.viewer.folder import WebCodec, WebOptions, write_web
+
+    with shown(arguments, "web") as progress:
+        summary = write_web(
+            arguments.scene, arguments.output, options=WebOptions(WebCodec(arguments.codec)), progress=progress
+        )
+    print_facts({"folder": str(arguments.output), **vars(summary)}, arguments.json, _web_text)
+    return 0
+
+
+def _web_text(facts: Mapping[str, Any]) -> str:
+    delta, video = (size_text(facts[key] / facts["frames"]) for key in ("delta_bytes", "video_bytes"))
+    return "\n".join(
+        [
+            f"{facts['folder']}: {facts['frames']} frames, {size_text(facts['bytes'])}; put it on any web server",
+            f"page       fetches {size_text(facts['delta_bytes'])} to play everything once, {delta} a frame",
+            f"video      {size_text(facts['video_bytes'])}, {video} a frame",
+            "check      both decode to exactly what the scene holds",
+        ]
+    )

@@ -1,0 +1,65 @@
+"""`packuv run`: one run from the command line, with or without the workflow engine."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.commands.progress import TerminalProgress
+from pipelines.events import Journal
+from pipelines.request import RunRequest, read_settings
+from pipelines.server import workflow_server
+from sync.capture import CaptureSettings
+
+if TYPE_CHECKING:
+    from pipelines.process import Outcome
+
+
+def command(arguments: argparse.Namespace) -> int:
+    """`packuv run` and the commands for its first stages."""
+    request = request_from(arguments)
+    progress = TerminalProgress(sys.stderr if arguments.json else sys.stdout)
+    with contextlib.closing(progress):
+        outcome = run(request, Journal(progress), direct=arguments.direct)
+    print(json.dumps(outcome.to_json(), indent=1) if arguments.json else outcome.farewell())
+    return 0
+
+
+def request_from(arguments: argparse.Namespace) -> RunRequest:
+    """What the arguments of `packuv run`, or of a command for one stage, ask for."""
+    return RunRequest(
+        capture=str(arguments.capture),
+        out=str(arguments.out),
+        preset=arguments.preset,
+        quality=arguments.quality,
+        settings=read_settings(arguments.config, arguments.set),
+        frames=arguments.frames,
+        hold_out=arguments.hold_out,
+        stop_after=arguments.stop_after if arguments.command == "run" else arguments.command,
+        device=arguments.device,
+        seed=arguments.seed,
+        jobs=arguments.jobs,
+    )
+
+
+def run(request: RunRequest, journal: Journal, *, direct: bool) -> Outcome:
+    """Process one sequence; raises ValueError or FileNotFoundError for bad input, whatever failed otherwise."""
+    if not Path(request.capture).is_dir():  # before anything starts; the rest of the capture is checked in its time
+        raise FileNotFoundError(f"no capture folder {request.capture}")
+    if direct:
+        from pipelines.process import process_directly
+
+        return process_directly(request, journal)
+    with workflow_server(Path(request.out)) as server:
+        journal.started("workflow engine")
+        from pipelines.options import compose  # takes seconds, in which the server starts
+        from pipelines.sequence import run_flow
+
+        compose(request.preset, CaptureSettings(), request.settings)  # a misspelt setting need not wait for the server
+        server.wait_ready()
+        journal.ended("workflow engine")
+        return run_flow(request, journal)

@@ -1,0 +1,203 @@
+"""The commands beside `packuv run`: make a synthetic capture, look at scene files, check, draw and score them.
+
+What turns scenes into other programs' files, or those into scenes, is in `pipelines.commands.exchange`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.commands.terminal import print_facts, shown, size_text
+from pipelines.request import read_settings
+from tasks.artefacts.recipe import override
+from tasks.artefacts.store import Store
+
+if TYPE_CHECKING:
+    from packuv.camera import PinholeCamera
+
+
+def simulate(arguments: argparse.Namespace) -> int:
+    """`packuv simulate`: a capture folder whose truth is known."""
+    from studio.capture import SimulateOptions
+    from studio.capture import simulate as film
+
+    width, height = arguments.size
+    plain = {name: getattr(arguments, name) for name in ("cameras", "frames", "fps", "seed")}
+    named = {**plain, "size": f"{width}x{height}", "rig": {"kind": arguments.rig}}
+    options = override(override(SimulateOptions(), named), read_settings(None, arguments.set))
+    with shown(arguments, "simulate") as progress:
+        film(arguments.out, options, progress)
+    print(f"{arguments.out}: {options.cameras} cameras, {options.frames} instants, {options.size}; truth in truth/")
+    return 0
+
+
+def info(arguments: argparse.Namespace) -> int:
+    """`packuv info`: what the header of a scene says."""
+    from packuv.scene import open_scene
+
+    with open_scene(arguments.scene) as scene:
+        index = scene.index
+        header = index.header
+        size = arguments.scene.stat().st_size
+        facts: dict[str, Any] = {
+            "file": str(arguments.scene),
+            "bytes": size,
+            "frames": len(scene),
+            "rate": str(header.rate),
+            "seconds": float((header.times_ns[-1] - header.times_ns[0]) / 1e9 + 1 / header.rate),
+            "bytes_per_frame": size / len(scene),
+            "sh_degree": header.quantizer.sh_degree,
+            "lossless": index.tolerance.exact,
+            "tolerance": vars(index.tolerance),
+            "cameras": [camera.name for camera in header.cameras],
+            "held_out": list(header.held_out),
+            "segments": [
+                {"first": s.first, "frames": s.frames, "gaussians": s.rows, "dynamic": s.dynamic}
+                for s in index.segments
+            ],
+            "sync": dict(header.sync),
+            "extra": dict(header.extra),
+            "tools": dict(index.tools),
+        }
+    print_facts(facts, arguments.json, _info_text)
+    return 0
+
+
+def _info_text(facts: Mapping[str, Any]) -> str:
+    counts = [segment["gaussians"] for segment in facts["segments"]]
+    moving = [segment["dynamic"] for segment in facts["segments"]]
+    held_out = f" (held out: {', '.join(facts['held_out'])})" if facts["held_out"] else ""
+    within = "within {position} steps of a position and {attribute} of any other code, of what was fitted"
+    exact = "exactly as fitted" if facts["lossless"] else within.format(**facts["tolerance"])
+    return "\n".join(
+        [
+            f"{facts['file']}: {size_text(facts['bytes'])}, {size_text(facts['bytes_per_frame'])} a frame",
+            f"frames     {facts['frames']} at {facts['rate']} per second, {facts['seconds']:.2f} s",
+            f"segments   {len(counts)}, from frame {', '.join(str(s['first']) for s in facts['segments'])}",
+            f"gaussians  {min(counts):,} to {max(counts):,}, of which {min(moving):,} to {max(moving):,} move; "
+            f"SH degree {facts['sh_degree']}",
+            f"codes      {exact}",
+            f"cameras    {len(facts['cameras'])}{held_out}",
+            f"tools      {', '.join(f'{name} {version}' for name, version in facts['tools'].items())}",
+        ]
+    )
+
+
+def verify(arguments: argparse.Namespace) -> int:
+    """`packuv verify`: exit code 1 if anything differs from what was written."""
+    return _verify_store(arguments) if arguments.store else _verify_scene(arguments)
+
+
+def _verify_scene(arguments: argparse.Namespace) -> int:
+    from packuv.scene import verify_scene
+
+    with shown(arguments, "verify") as progress:
+        report = verify_scene(arguments.scene, progress=progress)
+    facts = {**vars(report), "ok": report.ok}
+    good = f"{arguments.scene}: all {report.frames} frames decode to exactly what was written"
+    bad = f"{arguments.scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
+    print_facts(facts, arguments.json, lambda _: good if report.ok else bad)
+    return 0 if report.ok else 1
+
+
+def _verify_store(arguments: argparse.Namespace) -> int:
+    stores = [Store(path) for path in _stores(arguments.store)]
+    count = sum(len(list(store.keys())) for store in stores)
+    damage = [(store, found) for store in stores for found in store.verify()]
+    facts = {
+        "artefacts": count,
+        "damage": [{"artefact": str(d.key), "path": d.path, "reason": d.reason} for _, d in damage],
+        "ok": not damage,
+    }
+    lines = [f"{found}; delete {store.root / str(found.key)} and run again" for store, found in damage]
+    lines.append(f"{count} artefacts in {len(stores)} stores, {len(damage) or 'no'} damaged files")
+    print_facts(facts, arguments.json, lambda _: "\n".join(lines))
+    return 1 if damage else 0
+
+
+def _stores(folder: Path) -> list[Path]:
+    """The store itself, the store of a sequence, or the stores of all sequences of an output folder."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {folder}")
+    for found in ([folder] if folder.name == "store" else [], [folder / "store"], sorted(folder.glob("*/store"))):
+        if present := [path for path in found if path.is_dir()]:
+            return present
+    raise FileNotFoundError(f"{folder} holds no artefact store; name the folder that `packuv run --out` wrote")
+
+
+def render(arguments: argparse.Namespace) -> int:
+    """`packuv render`: <frame>.png for each frame, numbered as in the scene."""
+    from packuv.fit.device import choose_device
+    from packuv.scene import open_scene
+    from packuv.score import Artist, frames_of, write_picture
+
+    device = choose_device(arguments.device)
+    with open_scene(arguments.scene) as scene, shown(arguments, "render") as progress:
+        camera = _camera(arguments.camera, scene.header.cameras)
+        if arguments.size:
+            camera = camera.scaled(*arguments.size)
+        frames = frames_of(scene, *arguments.frames)
+        arguments.output.mkdir(parents=True, exist_ok=True)
+        artist = Artist(scene, device)
+        for done, frame in enumerate(frames, start=1):
+            write_picture(arguments.output / f"{frame:06d}.png", artist.draw(scene.gaussians(frame), camera))
+            progress(done, len(frames))
+    size = f"{camera.width}x{camera.height}"
+    print(f"{arguments.output}: {len(frames)} pictures of camera {camera.name}, {size}")
+    return 0
+
+
+def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
+    """A camera of the scene by name, or one from a JSON file in the scene's own form."""
+    from packuv.camera import PinholeCamera
+
+    for camera in known:
+        if camera.name == name:
+            return camera
+    if not Path(name).is_file():
+        names = ", ".join(camera.name for camera in known)
+        raise ValueError(f"{name!r} is neither a camera of the scene nor a file; the scene has {names}")
+    try:
+        return PinholeCamera.from_json({"name": Path(name).stem, **json.loads(Path(name).read_text())})
+    except (json.JSONDecodeError, TypeError) as error:
+        raise ValueError(f"{name} is no camera in JSON: {error}") from None
+
+
+def evaluate(arguments: argparse.Namespace) -> int:
+    """`packuv eval`: PSNR and SSIM of every frame against what cameras filmed."""
+    from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
+
+    with shown(arguments, "evaluate") as progress:
+        facts = evaluate_scene(
+            arguments.scene, arguments.capture, arguments.cameras, EvaluateOptions(), progress=progress
+        )
+    print_facts(facts, arguments.json, _scores_text)
+    return 0
+
+
+def _scores_text(facts: Mapping[str, Any]) -> str:
+    kinds = {"_rig": "common colour", "": "as filmed", "_own": "own gain"}
+    lines = [f"{'camera':<12}" + "".join(f"{text:>22}" for text in kinds.values())]
+    for name, means in {**facts["by_camera"], "mean": facts["mean"]}.items():
+        lines.append(f"{name:<12}" + "".join(f"{_score_text(means, kind):>22}" for kind in kinds))
+    what = "held out, never fitted" if facts["held_out"] else "not all held out"
+    lines.append(f"{facts['frames']} frames, {size_text(facts['bytes_per_frame'])} a frame; cameras {what}")
+    return "\n".join(lines)
+
+
+def _score_text(means: Mapping[str, float | None], kind: str) -> str:
+    decibel = means[f"psnr{kind}_db"]
+    level = "exact" if decibel is None else f"{decibel:.2f} dB"
+    return f"{level}, {means[f'ssim{kind}']:.4f}"
+
+
+def view(arguments: argparse.Namespace) -> int:
+    """`packuv view`: until Ctrl-C."""
+    from packuv.viewer import serve
+
+    serve(arguments.scene, port=arguments.port, open_browser=True)
+    return 0

@@ -1,0 +1,70 @@
+"""SHA-256 of files, remembered."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tasks.artefacts.recipe import write_json
+
+SETTLED_SECONDS = 2.0
+"""A file changed this recently is not remembered: a second change could leave size and time as they are"""
+
+
+class FileDigests:
+    """SHA-256 of files, remembered by size, modification time and inode, as git's index does."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __call__(
+        self, files: Mapping[str, Path], *, progress: Callable[[float, float, str], None] = lambda *_: None
+    ) -> dict[str, str]:
+        """Digest per name; cost: reading the files that changed since the last time.
+
+        Raises FileNotFoundError that names a missing file.
+        """
+        known = self._load()
+        found = {}
+        for number, path in enumerate(files.values()):
+            progress(number, len(files), path.name)
+            found[str(path.resolve())] = self._entry(path, known)
+        if any(known.get(name) != entry for name, entry in found.items()):
+            self._save({**known, **found})
+        return {name: found[str(path.resolve())][-1] for name, path in files.items()}
+
+    def _entry(self, path: Path, known: Mapping[str, list[Any]]) -> list[Any]:
+        if not path.is_file():
+            raise FileNotFoundError(f"no file {path}")
+        signature = _signature(path)
+        entry = known.get(str(path.resolve()))
+        if entry and entry[:-1] == signature:
+            return entry
+        sha256 = file_digest(path)
+        settled = time.time_ns() - signature[1] > SETTLED_SECONDS * 1e9 and _signature(path) == signature
+        return [*(signature if settled else [-1, -1, -1]), sha256]
+
+    def _load(self) -> dict[str, list[Any]]:
+        with contextlib.suppress(OSError, ValueError):  # only a memory: without it the files are read again
+            return json.loads(self.path.read_text())
+        return {}
+
+    def _save(self, entries: Mapping[str, list[Any]]) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(self.path, entries)
+
+
+def _signature(path: Path) -> list[int]:
+    stat = path.stat()
+    return [stat.st_size, stat.st_mtime_ns, stat.st_ino]
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's content, 64 hex digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

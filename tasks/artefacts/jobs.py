@@ -1,0 +1,291 @@
+"""Heavy work in processes of their own.
+
+A job is a function named by "module:function", called with plain arguments in a fresh interpreter. It dies with the
+thread that started it, also by kill -9; it can be ended from outside at any moment; its memory is its own; and what
+it prints goes to a log file. Run as `python -m tasks.artefacts.jobs SPEC.json`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import inspect
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from packuv.progress import Progress, no_progress
+from tasks.artefacts.recipe import plain, restore
+from tasks.artefacts.store import peak_memory_bytes
+
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+RAISED_AS = (FileNotFoundError, NotADirectoryError, PermissionError, OSError, ValueError, MemoryError)
+"""Kinds of exception that keep their kind on the way out of a job, the particular before the general"""
+PR_SET_PDEATHSIG = 1
+MARK = "PACKUV_JOB"
+"""Environment variable of a job and all that it starts: the folder it works for"""
+
+
+class JobError(RuntimeError):
+    """A job met a fault of the program. `log` holds the traceback."""
+
+    def __init__(self, message: str, log: Path) -> None:
+        super().__init__(message)
+        self.log = log
+
+
+class JobDiedError(JobError):
+    """A job ended without a word: killed, or crashed in native code. Trying again may help."""
+
+
+class CancelledError(RuntimeError):
+    """The jobs are being ended because somebody asked for it."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a job left."""
+
+    value: Any
+    """What the function returned, as plain values"""
+    peak_memory_bytes: int
+
+
+class Jobs:
+    """Starts jobs and can end them all; safe to use from several threads."""
+
+    def __init__(self, *, threads: int) -> None:
+        self.threads = threads
+        """Threads that each job may use"""
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._lock = threading.Lock()
+        self._cancelled = False
+
+    def run(
+        self,
+        function: str,
+        arguments: Mapping[str, Any],
+        *,
+        folder: Path,
+        progress: Progress = no_progress,
+        keep_open: Sequence[int] = (),
+    ) -> Done:
+        """Call `function` ("module:name") in a process of its own and wait for it.
+
+        Arguments are restored from plain values by the function's annotations; it gets `progress` beside them.
+        `folder` receives spec.json and job.log. The job inherits the descriptors in `keep_open`.
+
+        Raises what the function raised if that is ValueError, OSError or MemoryError (a subclass counts as these),
+        JobError for any other exception, JobDiedError if the process ended without a word, CancelledError after
+        `cancel`.
+        """
+        end_leftovers(folder)
+        spec = folder / "spec.json"
+        reader, writer = os.pipe()
+        with open(reader, "rb") as messages:
+            try:
+                text = {
+                    "function": function,
+                    "arguments": _with_text_paths(arguments),
+                    "parent": os.getpid(),
+                    "pipe": writer,
+                }
+                spec.write_text(json.dumps(text, indent=1))
+                process = self._start(spec, folder / "job.log", [writer, *keep_open])
+            finally:
+                os.close(writer)
+            with self._watched(process):
+                last = _follow(messages, progress)
+                process.wait()
+        return self._outcome(last, process.returncode, function, folder / "job.log")
+
+    def cancel(self) -> None:
+        """End all jobs and let no new one start."""
+        with self._lock:
+            self._cancelled = True
+            for process in self._running:
+                _kill(process)
+
+    def check(self) -> None:
+        """Raise CancelledError after `cancel`."""
+        if self._cancelled:
+            raise CancelledError("ended by the user; the same command goes on from here")
+
+    def _start(self, spec: Path, log: Path, descriptors: Sequence[int]) -> subprocess.Popen[bytes]:
+        self.check()
+        threads = {name: str(self.threads) for name in THREAD_VARIABLES}
+        mark = {MARK: str(spec.parent.absolute())}
+        with open(log, "ab") as output:
+            return subprocess.Popen(
+                # -P: a folder named tasks where the user stands must not win over ours
+                [sys.executable, "-P", "-m", "tasks.artefacts.jobs", str(spec)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env={**os.environ, **threads, **mark},
+                start_new_session=True,
+                pass_fds=descriptors,
+            )
+
+    @contextlib.contextmanager
+    def _watched(self, process: subprocess.Popen[bytes]) -> Iterator[None]:
+        with self._lock:
+            self._running.add(process)
+            if self._cancelled:
+                _kill(process)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._running.discard(process)
+                if process.poll() is None:  # this thread was interrupted
+                    _kill(process)
+            process.wait()
+
+    def _outcome(self, last: Mapping[str, Any] | None, code: int, function: str, log: Path) -> Done:
+        self.check()
+        if last is None:
+            raise JobDiedError(
+                f"the job {function} ended without a result ({_described(code)}); its output is in {log}", log
+            )
+        if "error" in last:
+            raise _exception(last["error"], log)
+        return Done(last["result"], last["peak_memory_bytes"])
+
+
+def _with_text_paths(value: Any) -> Any:
+    """Plain values for a job on this machine, for which, unlike for a recipe, a path is a value."""
+    match value:
+        case Path():
+            return str(value.absolute())
+        case Mapping():
+            return {name: _with_text_paths(item) for name, item in value.items()}
+        case list() | tuple():
+            return [_with_text_paths(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _with_text_paths(getattr(value, field.name)) for field in fields(value)}
+    return plain(value)
+
+
+def _follow(messages: Any, progress: Progress) -> dict[str, Any] | None:
+    """Pass progress on until the job closes its end; its last word, or None."""
+    last = None
+    for line in messages:
+        with contextlib.suppress(ValueError):  # a line cut short by a kill
+            message = json.loads(line)
+            if "done" in message:
+                progress(message["done"], message["total"], message["note"])
+            else:
+                last = message
+    return last
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End the job and what it started: it leads a session, and so a process group, of its own."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def end_leftovers(folder: Path) -> None:
+    """End processes that an earlier job in this folder started and that outlived it, as after a kill -9.
+
+    Linux only. The caller holds the lock on the folder, so no job that is still wanted works there.
+    """
+    mark = os.fsencode(f"{MARK}={folder.absolute()}")
+    for environment in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):  # ended meanwhile, or somebody else's
+            if mark in environment.read_bytes().split(b"\0"):
+                os.kill(int(environment.parent.name), signal.SIGKILL)
+
+
+def _described(code: int) -> str:
+    if code == -signal.SIGKILL:
+        return "killed by signal 9, as happens when memory runs out"
+    return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+
+
+def _exception(error: Mapping[str, Any], log: Path) -> Exception:
+    for kind in RAISED_AS:
+        if kind.__name__ in error["kinds"]:
+            raised = kind(error["message"])
+            if isinstance(raised, OSError):
+                raised.errno = error["errno"]
+            raised.add_note(f"the job's own traceback is in {log}")
+            return raised
+    return JobError(f"{error['kinds'][0]}: {error['message']}; the traceback is in {log}", log)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the job that a spec file describes; 0 if it delivered a result or an exception."""
+    spec = json.loads(Path(argv[0]).read_text())
+    die_with_parent(spec["parent"])
+    os.set_inheritable(spec["pipe"], False)
+    with open(spec["pipe"], "w", buffering=1) as pipe:
+        pipe.write(json.dumps(_result(spec, _reporter(pipe))) + "\n")
+    return 0
+
+
+def die_with_parent(parent: int) -> None:
+    """Have the kernel kill this process when the thread that started it ends; `parent` is that thread's process.
+
+    Linux only; elsewhere a job outlives a kill -9 of its parent, but holds its artefact's lock as long as it lives.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before the kernel knew
+        os._exit(1)
+
+
+def _reporter(pipe: Any) -> Progress:
+    lock = threading.Lock()
+
+    def progress(done: float, total: float, note: str = "") -> None:
+        with lock:
+            pipe.write(json.dumps({"done": float(done), "total": float(total), "note": note}) + "\n")
+
+    return progress
+
+
+def _result(spec: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+    try:
+        value = _call(spec["function"], spec["arguments"], progress)
+        return {"result": plain(value, where="result"), "peak_memory_bytes": peak_memory_bytes()}
+    except Exception as error:
+        traceback.print_exc()
+        kinds = [kind.__name__ for kind in type(error).__mro__]
+        return {"error": {"kinds": kinds, "message": _message(error), "errno": getattr(error, "errno", None)}}
+
+
+def _message(error: Exception) -> str:
+    """What was said; KeyError would show it in quotes."""
+    return str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+
+
+def _call(name: str, arguments: Mapping[str, Any], progress: Progress) -> Any:
+    module, _, function_name = name.partition(":")
+    function = getattr(importlib.import_module(module), function_name)
+    hints, parameters = get_type_hints(function), inspect.signature(function).parameters
+    offered = {"out", "scratch"} - parameters.keys()
+    given = {key: restore(hints[key], value, where=key) for key, value in arguments.items() if key not in offered}
+    if "progress" in parameters:
+        given["progress"] = progress
+    return function(**given)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,217 @@
+"""What a report tells: the figures of a run, what looks wrong in them, and all of it as JSON.
+
+`ReportInput` is what the stages left, in their own types where they have them. Every part may be missing. Whatever
+crosses a limit becomes a `Finding`: one sentence, shown first on the page and again beside its figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.accept import RigReport
+from calibration.rig import Rig
+from packuv.scene import Scene
+from packuv.scene.stream import REPEAT
+from sync.align import SyncReport
+
+MAX_PSNR_DB = 99.0
+"""Equal pictures have an infinite ratio, which neither JSON nor a mean can hold; they count as this"""
+
+SIZE_FRAMES = 30
+"""Sizes are quoted for this many frames"""
+
+
+class StageOutcome(StrEnum):
+    """How a stage came to its end."""
+
+    MADE = "made"
+    REUSED = "reused"
+    SKIPPED = "skipped"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """One stage of the run."""
+
+    label: str
+    outcome: StageOutcome
+    seconds: float
+    """Run time in this run; what a reused artefact cost when it was made is not in it"""
+    peak_memory_bytes: int | None = None
+    reason: str = ""
+    """Why it was skipped or failed"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "outcome", StageOutcome(self.outcome))  # records read from JSON bring text
+
+
+@dataclass(frozen=True)
+class MotionCurve:
+    """How much moves at each instant."""
+
+    magnitude_px: np.ndarray
+    """float [T]: M(t), the smoothed mean of |flow|, pixels"""
+    keyframes: tuple[int, ...]
+    """Instants at which segments start"""
+
+    def __post_init__(self) -> None:
+        count = len(self.magnitude_px)
+        if any(not 0 <= keyframe < count for keyframe in self.keyframes):
+            raise ValueError(f"keyframes must be instants 0 to {count - 1}, but are {self.keyframes}")
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """A render against a picture that was filmed."""
+
+    camera: str
+    frame: int
+    """Frame of the scene, from 0"""
+    psnr_db: float
+    ssim: float
+
+    @property
+    def level_db(self) -> float:
+        """The ratio as a finite number."""
+        return min(self.psnr_db, MAX_PSNR_DB)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two pictures of one view to lay side by side: files, or uint8 [H, W, 3] RGB."""
+
+    camera: str
+    frame: int
+    truth: Path | np.ndarray
+    render: Path | np.ndarray
+    choice: str = ""
+    """Why this frame was chosen: "first", "middle", "worst" """
+
+
+@dataclass(frozen=True)
+class SceneFigures:
+    """What the scene file holds."""
+
+    name: str
+    bytes: int
+    """Size of the file, its header included"""
+    rate: Fraction
+    frame_bytes: tuple[int, ...]
+    """Of each frame's pictures; the file's header and index come on top"""
+    gaussians: tuple[int, ...]
+    """Rows of each frame"""
+    dynamic: tuple[int, ...]
+    """Those among them that may change within their segment"""
+    verified: bool | None = None
+    """Whether every frame decodes to what was fitted; None: nobody looked"""
+    problem: str = ""
+    """What verification found wrong"""
+
+    def __post_init__(self) -> None:
+        if not len(self.frame_bytes) == len(self.gaussians) == len(self.dynamic):
+            raise ValueError(
+                f"figures of one scene must have one length, but have {len(self.frame_bytes)} sizes, "
+                f"{len(self.gaussians)} and {len(self.dynamic)} counts"
+            )
+
+    @property
+    def frames(self) -> int:
+        return len(self.frame_bytes)
+
+    @property
+    def mb_per_30_frames(self) -> float:
+        """Megabytes (10^6) of the whole file per 30 frames; 0 without frames."""
+        return self.bytes / 1e6 * SIZE_FRAMES / self.frames if self.frames else 0.0
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """All that a report may show; leave out what there is not."""
+
+    name: str
+    """The sequence, for people"""
+    command: str = ""
+    """What was typed, exactly"""
+    options: Any = None
+    """Options of the run: a dataclass or mapping that `tasks.artefacts.recipe.plain` takes"""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    host: str = ""
+    """Machine and device"""
+    finished: str = ""
+    """UTC, ISO 8601"""
+    seconds: float | None = None
+    """Time from start to end of the run; without it the sum of the stages is shown"""
+    sync: SyncReport | None = None
+    rig: Rig | None = None
+    """All cameras, held-out ones too, with their gains"""
+    held_out: tuple[str, ...] = ()
+    """Cameras that were never fitted"""
+    check: RigReport | None = None
+    motion: MotionCurve | None = None
+    scores: tuple[FrameScore, ...] = ()
+    """Of held-out cameras; of fitted ones where none was held out"""
+    scene: SceneFigures | None = None
+    pictures: tuple[Comparison, ...] = ()
+    stages: tuple[StageRecord, ...] = ()
+
+
+def scene_figures(scene: Scene, *, verified: bool | None = None, problem: str = "") -> SceneFigures:
+    """Figures of an open scene file, from its header alone."""
+    index = scene.index
+    sizes: list[int] = []
+    for number, segment in enumerate(index.segments):
+        packets = iter(index.tracks[-1].sizes[segment.first_packet :])
+        sizes.append(index.tracks[0].sizes[number])
+        sizes += [0 if prediction == REPEAT else next(packets) for prediction in segment.predictions]
+    return SceneFigures(
+        scene.path.name,
+        scene.path.stat().st_size,
+        scene.header.rate,
+        tuple(sizes),
+        tuple(segment.rows for segment in index.segments for _ in range(segment.frames)),
+        tuple(segment.dynamic for segment in index.segments for _ in range(segment.frames)),
+        verified,
+        problem,
+    )
+
+
+def frames_to_picture(scores: Sequence[FrameScore]) -> tuple[tuple[str, int, str], ...]:
+    """Which views deserve a picture: camera, frame and why, for the first, middle and worst frame of each camera."""
+    chosen: list[tuple[str, int, str]] = []
+    for camera, own in by_camera(scores).items():
+        worst = min(own, key=lambda score: (score.level_db, score.frame))
+        reasons: dict[int, list[str]] = {}
+        for score, why in ((own[0], "first"), (own[len(own) // 2], "middle"), (worst, "worst")):
+            reasons.setdefault(score.frame, []).append(why)
+        chosen += [(camera, frame, ", ".join(whys)) for frame, whys in reasons.items()]
+    return tuple(chosen)
+
+
+def by_camera(scores: Sequence[FrameScore]) -> dict[str, list[FrameScore]]:
+    """Scores of each camera, in order of frames; cameras by name."""
+    cameras: dict[str, list[FrameScore]] = {}
+    for score in sorted(scores, key=lambda item: (item.camera, item.frame)):
+        cameras.setdefault(score.camera, []).append(score)
+    return cameras
+
+
+def mean_by_frame(scores: Sequence[FrameScore]) -> dict[int, float]:
+    """Mean ratio of the cameras at each frame, dB, in order of frames."""
+    frames: dict[int, list[float]] = {}
+    for score in sorted(scores, key=lambda item: item.frame):
+        frames.setdefault(score.frame, []).append(score.level_db)
+    return {frame: float(np.mean(levels)) for frame, levels in frames.items()}
+
+
+# What looks wrong
+
+
+# report.json

@@ -1,0 +1,121 @@
+"""What a run's figures say about its result: what is good, doubtful or bad, by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tasks.report.facts import ReportInput, StageOutcome, by_camera, mean_by_frame
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a figure is bad enough to say so."""
+
+    matched_share: float = 0.90
+    """A camera with frames at fewer instants than this share leaves holes in the fit"""
+    drop_share: float = 0.02
+    """Missing frames as a share of a camera's timecodes: a network or disk that does not keep up"""
+    residual_share: float = 0.25
+    """95th percentile of the residuals, in frame periods: beyond it, moving things sit visibly elsewhere"""
+    gain: float = 1.25
+    """A colour gain above this, or below its inverse, is exposure that differs or a camera that sees little"""
+    camera_drop_db: float = 6.0
+    """A camera this far below the median camera is calibrated, synchronized or balanced worse than the others"""
+    frame_drop_db: float = 3.0
+    """A frame whose mean is this far below the median frame: motion that the fit could not follow"""
+    poor_db: float = 20.0
+    """A mean held-out ratio below this shows at a glance"""
+    dynamic_share: float = 0.5
+    """More dynamic Gaussians than this: noise passes for motion, and every frame pays for it"""
+
+
+LIMITS = Limits()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that a person should look at."""
+
+    section: str
+    """Id of the section on the page"""
+    text: str
+
+
+def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...]:
+    """Everything in the report that crosses a limit, in the order of the page."""
+    return (
+        *_run_findings(report),
+        *_sync_findings(report, limits),
+        *_rig_findings(report, limits),
+        *_score_findings(report, limits),
+        *_scene_findings(report, limits),
+    )
+
+
+def _run_findings(report: ReportInput) -> Iterator[Finding]:
+    for stage in report.stages:
+        if stage.outcome is StageOutcome.FAILED:
+            yield Finding("stages", f"The stage {stage.label!r} failed: {stage.reason or 'no reason was given'}.")
+
+
+def _sync_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
+    if report.sync is None:
+        return
+    for row in report.sync.cameras:
+        if row.matched_share < limits.matched_share:
+            yield Finding("sync", f"{row.camera} has a frame at only {row.matched_share:.0%} of the instants.")
+        if row.drops > limits.drop_share * max(1, row.lines):
+            yield Finding("sync", f"{row.camera} dropped {row.drops} of {row.lines + row.drops} frames.")
+        if row.residual_p95_ns > limits.residual_share * report.sync.period_ns > 0:
+            late = row.residual_p95_ns / report.sync.period_ns
+            yield Finding("sync", f"{row.camera}: one frame in twenty is {late:.2f} frame periods or more off.")
+    yield from (Finding("sync", f"{note}.") for note in report.sync.notes)
+
+
+def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
+    if report.check is not None:
+        yield from (Finding("rig", f"{camera}: {what}.") for camera, what in report.check.suspicious.items())
+    for camera in report.rig.cameras if report.rig else ():
+        worst = max(camera.gains, key=lambda gain: abs(math.log(gain)))
+        if not 1 / limits.gain <= worst <= limits.gain:
+            yield Finding("colour", f"{camera.name} needs a colour gain of {worst:.2f}.")
+
+
+def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
+    if not report.scores:
+        return
+    if not report.held_out:
+        yield Finding(
+            "quality", "No camera was held out, so the scores only tell how well the fit repeats what it saw."
+        )
+    cameras = {name: float(np.mean([s.level_db for s in own])) for name, own in by_camera(report.scores).items()}
+    middle = float(np.median(list(cameras.values())))
+    for name, level in cameras.items():
+        if level < middle - limits.camera_drop_db:
+            yield Finding("quality", f"{name} scores {level:.1f} dB, {middle - level:.1f} dB below the median camera.")
+    frames = mean_by_frame(report.scores)
+    usual = float(np.median(list(frames.values())))
+    low = [frame for frame, level in frames.items() if level < usual - limits.frame_drop_db]
+    if low:
+        worst = min(low, key=lambda frame: frames[frame])
+        text = f"{len(low)} of {len(frames)} frames score {limits.frame_drop_db:g} dB or more below the median frame"
+        yield Finding("quality", f"{text}, the worst being frame {worst} with {frames[worst]:.1f} dB.")
+    overall = float(np.mean(list(cameras.values())))
+    if overall < limits.poor_db:
+        yield Finding("quality", f"The mean of {overall:.1f} dB is poor: the difference shows at a glance.")
+
+
+def _scene_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
+    if report.scene is None:
+        return
+    if report.scene.verified is False:
+        yield Finding(
+            "size", f"The scene file does not decode to what was fitted: {report.scene.problem or 'unknown'}."
+        )
+    share = sum(report.scene.dynamic) / max(1, sum(report.scene.gaussians))
+    if share > limits.dynamic_share:
+        yield Finding("gaussians", f"{share:.0%} of the Gaussians are dynamic: noise may pass for motion.")

@@ -1,0 +1,67 @@
+"""The report of a run: report.json for programs, report.html for people."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from tasks.artefacts.recipe import write_json
+from tasks.report.facts import (
+    Comparison,
+    FrameScore,
+    MotionCurve,
+    ReportInput,
+    SceneFigures,
+    StageOutcome,
+    StageRecord,
+    frames_to_picture,
+    scene_figures,
+)
+from tasks.report.findings import LIMITS, Finding, Limits, findings
+from tasks.report.page import page_text
+from tasks.report.record import report_json
+
+__all__ = [
+    "Comparison",
+    "Finding",
+    "FrameScore",
+    "Limits",
+    "MotionCurve",
+    "ReportFiles",
+    "ReportInput",
+    "SceneFigures",
+    "StageOutcome",
+    "StageRecord",
+    "findings",
+    "frames_to_picture",
+    "scene_figures",
+    "write_report",
+]
+
+JSON_NAME = "report.json"
+PAGE_NAME = "report.html"
+
+
+@dataclass(frozen=True)
+class ReportFiles:
+    """What `write_report` wrote."""
+
+    json: Path
+    page: Path
+
+
+def write_report(report: ReportInput, folder: Path, *, limits: Limits = LIMITS) -> ReportFiles:
+    """Write report.json and report.html into `folder`, which is made where it is missing.
+
+    Each file is replaced in one step. Raises FileNotFoundError for a picture that is not there, ValueError for one
+    that cannot be read or does not match its counterpart.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = ReportFiles(folder / JSON_NAME, folder / PAGE_NAME)
+    text = page_text(report, limits)
+    write_json(files.json, report_json(report, limits))
+    partial = files.page.with_name(f".{PAGE_NAME}.{os.getpid()}.part")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, files.page)
+    return files

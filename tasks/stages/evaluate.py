@@ -1,0 +1,128 @@
+"""Evaluate: how close a scene's pictures are to what cameras filmed, above all those that were never fitted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from packuv.files import write_json
+from packuv.footage.lens import LensCamera
+from packuv.footage.views import Views
+from packuv.progress import Progress
+from packuv.scene import open_scene
+from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
+from sync.align import AlignOptions, FrameGroups, align
+from sync.capture import find_capture, load_timecodes
+from sync.clock import ClockMode
+from sync.probe import probe_video
+from tasks.artefacts.store import Key
+from tasks.artefacts.workshop import Workshop
+from tasks.report.facts import FrameScore, frames_to_picture
+from tasks.stages.encode import SCENE
+from tasks.stages.footage import Footage, PictureOptions, footage_of
+from tasks.stages.plan import Plan
+
+VERSION = 2
+METRICS, TABLE, PICTURES = "metrics.json", "metrics.arrow", "pictures"
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """Which cameras are scored where none is held out."""
+
+    fitted_cameras: int = 3
+    """Fitted cameras to score, spread over the rig, where no camera is held out"""
+
+    def __post_init__(self) -> None:
+        if self.fitted_cameras < 1:
+            raise ValueError(f"evaluation needs at least one camera, but fitted_cameras is {self.fitted_cameras}")
+
+
+def evaluate(
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    points: Key,
+    scene: Key,
+    pictures: PictureOptions,
+    options: EvaluateOptions,
+) -> Key:
+    """Score every frame of the scene file on the held-out cameras: metrics.json, metrics.arrow, pictures/."""
+    cameras = plan.held_out or spread(plan.fitted, options.fitted_cameras)
+    if not plan.held_out:
+        workshop.listener.skipped("unseen scores", f"no camera is held out; scored on fitted {', '.join(cameras)}")
+    arguments = {
+        "footage": footage_of(workshop, plan, groups, points, cameras=cameras, pictures=pictures),
+        "scene": workshop.path(scene) / SCENE,
+        "options": options,
+    }
+    reads = {"evaluate": options, "pictures": pictures, "cameras": cameras, "first": plan.first}
+    inputs = {"groups": groups, "points": points, "scene": scene}
+    return workshop.make("evaluate", VERSION, reads, inputs, "tasks.stages.evaluate:build", arguments)
+
+
+def build(footage: Footage, scene: Path, options: EvaluateOptions, out: Path, progress: Progress) -> dict[str, Any]:
+    """The job behind `evaluate`."""
+    views = footage.open_views()
+    with open_scene(scene) as opened:
+        scores = score(opened, views, progress)
+        write_table(out / TABLE, scores)
+        write_pictures(out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
+        facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
+    write_json(out / METRICS, facts)
+    return {name: facts[name] for name in ("cameras", "held_out", "mean")}
+
+
+def evaluate_scene(
+    scene: Path, capture: Path, cameras: Sequence[str] | None, options: EvaluateOptions, progress: Progress
+) -> dict[str, Any]:
+    """Score a scene file against a capture folder, without a store; the summary that `evaluate` writes.
+
+    The frames of the capture are matched again as the scene's header says, and found by their times. Raises
+    ValueError for a camera that the scene does not know, or a capture that did not film the scene's instants.
+    """
+    with open_scene(scene) as opened:
+        header = opened.header
+        lenses = {item["name"]: LensCamera.from_json(item) for item in header.extra["lenses"]}
+        fitted = [name for name in lenses if name not in header.held_out]
+        names = tuple(cameras or header.held_out) or spread(fitted, options.fitted_cameras)
+        if unknown := [name for name in names if name not in lenses]:
+            raise ValueError(f"the scene has no camera {', '.join(unknown)}; it has {', '.join(lenses)}")
+        groups = _matched(capture, header.sync)
+        rows = _rows(groups, header.times_ns)
+        columns = [groups.cameras.index(name) for name in names]
+        frames = groups.frames[rows][:, columns]
+        width = header.extra["max_width"]
+        views = Views(find_capture(capture).videos, frames, [lenses[name] for name in names], max_width=width)
+        scores = score(opened, views, progress)
+        return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
+
+
+def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
+    found = find_capture(capture)
+    infos = {camera: probe_video(path) for camera, path in found.videos.items()}
+    options = AlignOptions(
+        reference=sync["reference"], tolerance_ns=sync["tolerance_ns"], clock=ClockMode(sync["clock"])
+    )
+    return align(load_timecodes(found, infos), options)[0]
+
+
+def _rows(groups: FrameGroups, times_ns: np.ndarray) -> np.ndarray:
+    """Rows of the groups that were filmed at these times."""
+    rows = np.searchsorted(groups.times_ns, times_ns)
+    if (rows >= len(groups)).any() or (groups.times_ns[np.minimum(rows, len(groups) - 1)] != times_ns).any():
+        raise ValueError("the capture did not film the scene's instants; is it the one that the scene was made from?")
+    return rows
+
+
+def frame_scores(scores: Sequence[Score]) -> tuple[FrameScore, ...]:
+    """Scores in the rig's common colour, as the report shows them."""
+    return tuple(
+        FrameScore(item.camera, item.frame, math.inf if item.psnr_rig_db is None else item.psnr_rig_db, item.ssim_rig)
+        for item in scores
+    )

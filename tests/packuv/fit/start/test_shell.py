@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+
+from packuv.camera import PinholeCamera
+from packuv.fit.start.bounds import Bounds
+from packuv.fit.start.shell import ShellOptions, directions, interpolate, sweep_shell
+
+RADII = np.array([5.0, 5.6, 4.7])
+"""Half axes of the room in these tests: an ellipsoid about the origin"""
+BOUNDS = Bounds(np.zeros(3), 4.2, 0.3)
+OPTIONS = ShellOptions(columns=256, steps=48, farthest=4.0)
+
+
+def wall_picture(camera: PinholeCamera, *, contrast: float) -> np.ndarray:
+    """What a camera inside the ellipsoid sees: a smooth random pattern painted on the wall, float32 [3, H, W]."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    local = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
+    rays, origin = local @ camera.camera_from_world[:3, :3], camera.centre
+    a, b, c = ((rays / RADII) ** 2).sum(-1), (rays * origin / RADII**2).sum(-1), ((origin / RADII) ** 2).sum() - 1
+    wall = origin + rays * ((-b + np.sqrt(b * b - a * c)) / a)[..., None]
+    waves = np.random.default_rng(7).normal(size=(40, 3)) * 3
+    pattern = np.cos(wall @ waves.T + np.arange(40)).sum(-1) / 40
+    grey = 0.5 + contrast * pattern
+    return np.stack([grey, 0.8 * grey, 0.5 * grey]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def room(ring):
+    cameras = ring(18)
+    return cameras, [wall_picture(camera, contrast=0.8) for camera in cameras]
+
+
+def test_places_that_cameras_agree_on_lie_on_the_wall(room):
+    shell = sweep_shell(*room, bounds=BOUNDS, options=OPTIONS)
+    assert shell is not None
+    off = np.sqrt((shell.xyz[shell.sure] ** 2 / RADII**2).sum(-1)) - 1
+    assert shell.sure.mean() > 0.05
+    # One step of the sweep is 3.7 % of the distance; agreement between steps is interpolated.
+    assert np.median(np.abs(off)) < 0.01
+    assert np.quantile(np.abs(off), 0.95) < 0.05
+
+
+def test_the_rest_of_the_wall_continues_what_is_sure(room):
+    shell = sweep_shell(*room, bounds=BOUNDS, options=OPTIONS)
+    assert shell is not None
+    cover = shell.cover(2000)
+    assert 100 < len(cover.xyz) < 2000
+    off = np.sqrt((cover.xyz**2 / RADII**2).sum(-1)) - 1
+    assert np.median(np.abs(off)) < 0.1
+    assert cover.rgb.min() >= 0
+    assert cover.rgb.max() <= 1
+
+
+def test_sure_points_are_drawn_by_the_seed(room):
+    shell = sweep_shell(*room, bounds=BOUNDS, options=OPTIONS)
+    assert shell is not None
+    first, again = (shell.sure_points(500, np.random.default_rng(3)).xyz for _ in range(2))
+    assert len(first) == 500
+    np.testing.assert_array_equal(first, again)
+
+
+def test_blank_walls_have_no_shell(room):
+    blank = [np.full_like(picture, 0.4) for picture in room[1]]
+    assert sweep_shell(room[0], blank, bounds=BOUNDS, options=OPTIONS) is None
+
+
+def test_a_different_brightness_of_one_camera_changes_nothing_but_colours(room):
+    cameras, pictures = room
+    shell = sweep_shell(cameras, pictures, bounds=BOUNDS, options=OPTIONS)
+    other = sweep_shell(cameras, [0.7 * pictures[0] + 0.1, *pictures[1:]], bounds=BOUNDS, options=OPTIONS)
+    assert shell is not None
+    assert other is not None
+    # Contrast falls by a third, and with it the say of one camera in eighteen.
+    assert (shell.sure == other.sure).mean() > 0.97
+
+
+def test_interpolation_keeps_what_is_known_and_constants():
+    rng = np.random.default_rng(0)
+    values, known = rng.random((32, 64)), rng.random((32, 64)) < 0.2
+    filled = interpolate(values, known.astype(float))
+    np.testing.assert_allclose(filled[known], values[known], rtol=1e-12)
+    assert filled.min() >= values[known].min() - 1e-12
+    assert filled.max() <= values[known].max() + 1e-12
+    np.testing.assert_allclose(interpolate(np.full((32, 64), 2.5), known.astype(float)), 2.5, rtol=1e-12)
+
+
+def test_directions_are_unit_vectors_and_start_at_the_z_axis():
+    rays = directions(128)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, rtol=1e-12)
+    assert rays[0, :, 2].min() > 0.999
+    assert rays[-1, :, 2].max() < -0.999
+
+
+def test_options_refuse_what_cannot_be_swept():
+    with pytest.raises(ValueError, match="odd window"):
+        ShellOptions(window=6)
+    with pytest.raises(ValueError, match="nearest < farthest"):
+        ShellOptions(nearest=3.0, farthest=2.0)

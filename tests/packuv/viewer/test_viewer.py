@@ -1,0 +1,388 @@
+"""The viewer: what the server sends decodes to the very codes, and the page draws what the rasterizer draws."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from packuv.camera import PinholeCamera
+from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
+from packuv.gaussians.segment import Segment
+from packuv.viewer import serve
+from packuv.viewer import server as viewer_server
+from packuv.viewer.server import PAGES, ViewerServer
+from packuv.viewer.source import (
+    SegmentSource,
+    Source,
+    describe,
+    frame_bytes,
+    key_bytes,
+    near_plane,
+    open_source,
+    tables_bytes,
+)
+from tests.support.browser import Browser, running_browser
+
+PAGE_FOLDER = Path(viewer_server.__file__).parent
+
+
+def make_quantizer(sh_degree: int = 0) -> Quantizer:
+    count = attribute_count(sh_degree)
+    low, high = np.full(count, -1.5), np.full(count, 1.5)
+    low[:3], high[:3] = -4.5, -1.5  # natural log of the scales
+    low[3:6], high[3:6] = -1, 1
+    low[6], high[6] = OPACITY_RANGE
+    return Quantizer(np.array([0.3, -0.2, 0.1]), 1.0, np.array([2.0, 2.0, 2.0]), low, high, sh_degree)
+
+
+def make_segment(
+    rng: np.random.Generator, first: int, *, length: int, count: int, dynamic: float, columns: int
+) -> Segment:
+    moves = rng.random(count) < dynamic
+    shape = (length - 1, int(moves.sum()))
+    key = Codes(
+        rng.integers(0, 65536, (count, 3), dtype=np.uint16), rng.integers(0, 256, (count, columns), dtype=np.uint8)
+    )
+    xyz = rng.integers(0, 65536, (*shape, 3), dtype=np.uint16)
+    return Segment(first, key, moves, xyz, rng.integers(0, 256, (*shape, columns), dtype=np.uint8))
+
+
+def make_ring(count: int = 4, width: int = 160, height: int = 120) -> tuple[PinholeCamera, ...]:
+    cameras = []
+    for index, angle in enumerate(np.arange(count) * 2 * np.pi / count):
+        eye = np.array([5 * np.sin(angle), -1.0, 5 * np.cos(angle)])
+        forward = -eye / np.linalg.norm(eye)
+        right = np.cross([0.0, 1.0, 0.0], forward)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = [right, np.cross(forward, right), forward]
+        pose[:3, 3] = -pose[:3, :3] @ eye
+        cameras.append(PinholeCamera(f"cam{index}", width, height, 150.0, 140.0, width / 2 + 7, height / 2 - 4, pose))
+    return tuple(cameras)
+
+
+def make_source(sh_degree: int = 0, *, count: int = 300, dynamic: float = 0.3) -> SegmentSource:
+    rng = np.random.default_rng(5)
+    columns = attribute_count(sh_degree)
+    parts = [
+        make_segment(rng, first, length=length, count=count, dynamic=dynamic, columns=columns)
+        for first, length in ((0, 4), (4, 1), (5, 3))
+    ]
+    return SegmentSource(
+        tuple(parts), make_quantizer(sh_degree), Fraction(30000, 1001), make_ring(), held_out=frozenset({"cam2"})
+    )
+
+
+def read_key(body: bytes) -> tuple[Codes, np.ndarray]:
+    """The page's side of `key_bytes`, written from docs/viewer.md."""
+    count, moving, columns, _ = np.frombuffer(body, "<u4", 4)
+    xyz = np.frombuffer(body, "<u2", 3 * count, 16).reshape(3, count)
+    attributes = np.frombuffer(body, np.uint8, columns * count, 16 + 6 * count).reshape(columns, count)
+    dynamic = np.frombuffer(body, np.uint8, count, 16 + (6 + columns) * count).astype(bool)
+    assert dynamic.sum() == moving
+    assert len(body) == 16 + (7 + columns) * count
+    return Codes(xyz.T.astype(np.uint16), attributes.T), dynamic
+
+
+def read_frame(body: bytes, keys: list[tuple[Codes, np.ndarray]]) -> Codes:
+    """The page's side of `frame_bytes`: the whole frame, the keyframe's static rows included."""
+    segment, moving, columns, _ = np.frombuffer(body, "<u4", 4)
+    key, dynamic = keys[segment]
+    xyz, attributes = key.xyz.copy(), key.attributes.copy()
+    xyz[dynamic] += np.frombuffer(body, "<u2", 3 * moving, 16).reshape(3, moving).T
+    attributes[dynamic] += np.frombuffer(body, np.uint8, columns * moving, 16 + 6 * moving).reshape(columns, moving).T
+    assert len(body) == 16 + (6 + columns) * moving
+    return Codes(xyz, attributes)
+
+
+def assert_same(left: Codes, right: Codes) -> None:
+    assert np.array_equal(left.xyz, right.xyz)
+    assert np.array_equal(left.attributes, right.attributes)
+
+
+# ---- bytes
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    lengths=st.lists(st.integers(1, 4), min_size=1, max_size=3),
+    count=st.integers(1, 40),
+    dynamic=st.sampled_from([0.0, 0.3, 1.0]),
+    sh_degree=st.integers(0, 3),
+)
+def test_what_is_sent_decodes_to_the_codes(
+    seed: int, lengths: list[int], count: int, dynamic: float, sh_degree: int
+) -> None:
+    rng, columns, instant = np.random.default_rng(seed), attribute_count(sh_degree), 17
+    parts = []
+    for length in lengths:
+        parts.append(make_segment(rng, instant, length=length, count=count, dynamic=dynamic, columns=columns))
+        instant += length
+    source = SegmentSource(tuple(parts), make_quantizer(sh_degree))
+    keys = [read_key(key_bytes(source, number)) for number in range(len(parts))]
+    wanted = [part.frame(offset) for part in parts for offset in range(len(part))]
+    for frame, codes in enumerate(wanted):
+        assert_same(read_frame(frame_bytes(source, frame), keys), codes)
+    for (key, mask), part in zip(keys, parts, strict=True):
+        assert_same(key, part.key)
+        assert np.array_equal(mask, part.dynamic)
+
+
+def test_the_tables_are_the_quantizers() -> None:
+    quantizer = make_quantizer(1)
+    values = np.frombuffer(tables_bytes(quantizer), "<f4")
+    positions, attributes = np.split(values, [3 * 65536])
+    assert np.array_equal(positions.reshape(3, 65536), quantizer.xyz_table)
+    assert np.array_equal(attributes.reshape(-1, 256), quantizer.attribute_table)
+
+
+def test_segments_must_follow_one_another() -> None:
+    source = make_source()
+    with pytest.raises(ValueError, match="one ends at 4, the next begins at 5"):
+        replace(source, parts=(source.parts[0], source.parts[2]))
+    with pytest.raises(ValueError, match="fit one first"):
+        replace(source, parts=())
+
+
+def test_the_near_plane_is_the_scenes_own_or_scales_with_the_rig() -> None:
+    source = make_source()
+    assert near_plane(replace(source, near=0.25)) == 0.25
+    assert near_plane(source) == pytest.approx(0.02 * 5.0, rel=0.02)  # the ring's radius, its height aside
+    assert near_plane(replace(source, cameras=())) == 0.02 * source.quantizer.unit
+
+
+# ---- scene files
+
+
+@pytest.fixture(scope="module")
+def scene_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scene = pytest.importorskip("packuv.scene.reader")
+    folder, source = tmp_path_factory.mktemp("scene"), make_source(1)
+    paths = []
+    for number, part in enumerate(source.parts):
+        paths.append(folder / f"{number}.npz")
+        part.save(paths[-1])
+    header = scene.SceneHeader(
+        source.quantizer, source.times_ns, source.rate, source.cameras, ("cam2",), extra={"near": 0.125}
+    )
+    scene.write_scene(folder / "scene.mkv", paths, header)
+    return folder / "scene.mkv"
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5, 6, 7), (7, 6, 5, 4, 3, 2, 1, 0), (3, 1, 6, 0, 2, 7, 5, 4)])
+def test_a_scene_file_gives_its_codes_in_any_order(scene_path: Path, order: tuple[int, ...]) -> None:
+    from packuv.scene import open_scene
+
+    with open_source(scene_path) as source, open_scene(scene_path) as scene:
+        keys = {number: read_key(key_bytes(source, number)) for number in (2, 0, 1)}
+        for frame in order:
+            got = read_frame(frame_bytes(source, frame), [keys[number] for number in range(3)])
+            assert_same(got, scene.codes(frame))
+
+
+def test_a_scene_file_describes_itself_like_its_segments(scene_path: Path) -> None:
+    with open_source(scene_path) as source:
+        told = describe(source)
+        wanted = describe(replace(make_source(1), name="scene.mkv", near=0.125))
+    assert told == wanted
+
+
+def test_serve_refuses_what_is_no_scene(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        serve(tmp_path / "none.mkv")
+    (tmp_path / "text.mkv").write_text("not a scene")
+    with pytest.raises(ValueError, match=r"text\.mkv"):
+        serve(tmp_path / "text.mkv")
+
+
+def test_serve_answers_until_it_is_interrupted(scene_path: Path) -> None:
+    program = (
+        "import signal, sys; from pathlib import Path; from packuv.viewer import serve; "
+        "signal.signal(signal.SIGINT, signal.default_int_handler); "  # a job in the background is born deaf to it
+        "serve(Path(sys.argv[1]))"
+    )
+    command = [sys.executable, "-c", program, str(scene_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        url = process.stdout.readline().strip()
+        with urllib.request.urlopen(f"{url}scene.json", timeout=10) as answer:
+            assert json.load(answer)["name"] == "scene.mkv"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 0
+
+
+# ---- server
+
+
+@contextlib.contextmanager
+def running(source: Source) -> Iterator[ViewerServer]:
+    with ViewerServer(("127.0.0.1", 0), source) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def fetch(
+    server: ViewerServer, path: str, *, method: str = "GET", **headers: str
+) -> tuple[http.client.HTTPResponse, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
+    with contextlib.closing(connection):
+        connection.request(method, path, headers=headers)
+        answer = connection.getresponse()
+        body = answer.read()
+    return answer, zlib.decompress(body) if answer.getheader("Content-Encoding") == "deflate" and body else body
+
+
+@pytest.mark.parametrize("encoding", ["identity", "gzip, deflate"])
+def test_every_frame_arrives_exactly(encoding: str) -> None:
+    source = make_source(1)
+    with running(source) as server:
+        bodies = [fetch(server, f"/segments/{n}.bin", **{"Accept-Encoding": encoding})[1] for n in range(3)]
+        keys = [read_key(body) for body in bodies]
+        for frame in range(8):
+            answer, body = fetch(server, f"/frames/{frame}.bin", **{"Accept-Encoding": encoding})
+            assert answer.getheader("Content-Encoding") == ("deflate" if "deflate" in encoding else None)
+            part = source.parts[(0, 0, 0, 0, 1, 2, 2, 2)[frame]]
+            assert_same(read_frame(body, keys), part.frame(frame - part.first))
+
+
+def test_scene_json_names_frames_and_cameras() -> None:
+    with running(make_source()) as server:
+        told = json.loads(fetch(server, "/scene.json")[1])
+    assert [(s["first"], s["length"]) for s in told["segments"]] == [(0, 4), (4, 1), (5, 3)]
+    assert [camera["held_out"] for camera in told["cameras"]] == [False, False, True, False]
+    assert PinholeCamera.from_json(told["cameras"][1]).name == "cam1"
+    assert told["times_ns"] == [index * 1001 * 10**9 // 30000 for index in range(8)]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/frames/8.bin", "/segments/3.bin", "/frames/-1.bin", "/frames/01.bin", "/frames/99999999999.bin", "/frames/0",
+        "/server.py", "/../server.py", "/%2e%2e/server.py", "//etc/passwd", "/page.html", "/nothing",
+    ],
+)  # fmt: skip
+def test_bad_paths_are_not_found(path: str) -> None:
+    with running(make_source()) as server:
+        answer, body = fetch(server, path)
+    assert (answer.status, body) == (404, b"nothing here\n")
+
+
+def test_head_tells_the_size_and_sends_nothing() -> None:
+    with running(make_source()) as server:
+        whole = fetch(server, "/scene.json")[1]
+        answer, body = fetch(server, "/scene.json", method="HEAD")
+    assert (answer.status, int(answer.getheader("Content-Length", "0")), body) == (200, len(whole), b"")
+
+
+def test_a_site_that_points_its_name_here_reads_nothing() -> None:
+    with running(make_source()) as server:
+        assert fetch(server, "/frames/0.bin", Host="attacker.example:80")[0].status == 403
+        assert fetch(server, "/frames/0.bin", Host="localhost:1234")[0].status == 200
+
+
+def test_damage_reaches_the_page_as_words() -> None:
+    class Damaged(SegmentSource):
+        def moving(self, frame: int) -> Codes:
+            raise ValueError("packet 3 is damaged")
+
+    with running(Damaged(make_source().parts, make_quantizer())) as server:
+        answer, body = fetch(server, "/frames/1.bin")
+    assert (answer.status, body) == (500, b"/frames/1.bin: packet 3 is damaged\n")
+
+
+# ---- page
+
+
+def test_the_page_loads_nothing_from_elsewhere() -> None:
+    with running(make_source()) as server:
+        for path, (_, kind) in PAGES.items():
+            answer, body = fetch(server, path)
+            assert (answer.status, answer.getheader("Content-Type")) == (200, kind)
+            assert not re.search(rb"(https?:)?//[a-z0-9-]+\.[a-z]", body, re.IGNORECASE)
+            assert "default-src 'self'" in answer.getheader("Content-Security-Policy", "")
+
+
+def test_every_script_that_is_named_is_served() -> None:
+    named = set()
+    for name, _ in PAGES.values():
+        text = (PAGE_FOLDER / name).read_text()
+        named |= set(re.findall(r'(?:src=|from |Worker\()"(?:\./)?([\w.]+)"', text))
+    assert named == {path.lstrip("/") for path in PAGES} - {""}
+
+
+def test_ids_that_the_script_asks_for_are_on_the_page() -> None:
+    page = (PAGE_FOLDER / "page.html").read_text()
+    present = set(re.findall(r'id="([\w-]+)"', page))
+    script = (PAGE_FOLDER / "viewer.js").read_text()
+    asked = set(re.findall(r'(?:at|press)\("([\w-]+)"', script))
+    assert asked - present == set()
+
+
+# ---- end to end
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with running_browser(tmp_path_factory.mktemp("profile")) as started:
+        yield started
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_the_page_draws_what_the_rasterizer_draws(browser: Browser, sh_degree: int) -> None:
+    from packuv.raster import RasterOptions, render
+
+    source = replace(make_source(sh_degree), near=0.1)
+    camera, background = source.cameras[2], (0.2, 0.4, 0.6)
+    with running(source) as server:
+        wish = f"bare=1&play=0&frame=6&camera={camera.name}&background={','.join(map(str, background))}"
+        browser.open(f"{server.url}#{wish}", camera.width, camera.height)
+        browser.wait_for("document.documentElement.dataset.frame == 6")
+        shown = browser.picture().astype(np.float64) / 255
+    gaussians = source.quantizer.decode(source.parts[2].frame(1))
+    wanted = render(gaussians, camera, options=RasterOptions(near=0.1), background=background).colour
+    error = shown - np.clip(wanted.transpose(1, 2, 0), 0, 1)
+    # 8 bits alone allow 59 dB; half floats and depth ties inside 1/4096 take the rest. Measured: see docs/viewer.md.
+    assert -10 * np.log10(np.mean(error**2)) > 52
+    assert wanted.std() > 0.1  # there is something to compare
+
+
+@pytest.mark.slow
+def test_playback_stands_still_where_the_buffer_ends(browser: Browser) -> None:
+    class Stuck(SegmentSource):
+        def moving(self, frame: int) -> Codes:
+            if frame >= 6:
+                raise ValueError("frame 6 will never come")
+            return super().moving(frame)
+
+    whole = make_source()
+    with running(Stuck(whole.parts, whole.quantizer, Fraction(20), whole.cameras)) as server:
+        browser.open(f"{server.url}#camera=cam1", 480, 360)
+        browser.wait_for("document.documentElement.dataset.frame == 5")
+        time.sleep(1)  # 20 frames' time
+        assert browser.evaluate("document.documentElement.dataset.frame") == "5"
+        assert "will never come" in browser.evaluate("document.getElementById('wait').textContent")

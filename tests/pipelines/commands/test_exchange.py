@@ -1,0 +1,158 @@
+"""The commands that turn scenes into other programs' files, and those into scenes."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.importers import load_rig
+from packuv.atlas.video import AtlasVideo
+from packuv.camera import PinholeCamera
+from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer
+from packuv.gaussians.floats import drawn
+from packuv.gaussians.segment import Segment
+from packuv.interchange import read_gaussians
+from packuv.scene import SceneHeader, open_scene, write_scene
+from pipelines.cli import OK, WRONG, main
+
+ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+
+
+def cameras(square):
+    """Two that look at the origin from -z and from +x; the first is one that LLFF cannot hold unless `square`."""
+    turned = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 5], [0, 0, 0, 1]])
+    ahead = np.eye(4)
+    ahead[2, 3] = 5
+    return (
+        PinholeCamera("b", 64, 48, 60.25, 60.25 if square else 61, 32, 24, ahead),
+        PinholeCamera("a", 64, 48, 55.5, 55.5, 32, 24, turned),
+    )
+
+
+def write_small_scene(path, *, square=True):
+    rng = np.random.default_rng(0)
+    low, high = np.full(10, -3.0), np.full(10, 1.0)
+    low[3:6], high[3:6] = -0.71, 0.71
+    low[OPACITY], high[OPACITY] = OPACITY_RANGE
+    quantizer = Quantizer(np.zeros(3), 1.0, np.full(3, 2.0), low, high)
+    key = Codes(rng.integers(0, 65536, (90, 3), np.uint16), rng.integers(60, 200, (90, 10), np.uint8))
+    moving = np.arange(90) < 30
+    xyz = key.xyz[None, :30] + rng.integers(0, 50, (2, 30, 3), np.uint16)
+    attributes = np.repeat(key.attributes[None, :30], 2, axis=0)
+    attributes[1, :4, OPACITY] = 0
+    Segment(0, key, moving, xyz, attributes).save(path.with_suffix(".npz"))
+    times = np.array([0, 33_000_000, 67_000_000], dtype=np.int64)
+    header = SceneHeader(quantizer, times, Fraction(30), cameras(square), extra={"near": 0.05})
+    write_scene(path, [path.with_suffix(".npz")], header)
+    path.with_suffix(".npz").unlink()
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_small_scene(tmp_path_factory.mktemp("exchange") / "a.mkv")
+
+
+def run(*words):
+    return main([str(word) for word in words])
+
+
+@pytest.mark.parametrize("words", [["export"], ["export", "frames"]])
+def test_a_frame_is_exported_exactly(scene, tmp_path, words, capsys):
+    assert run(*words, scene, "--frame", 2, "-o", tmp_path / "a.ply") == OK
+    assert "86 Gaussians of frame 2" in capsys.readouterr().out
+    with open_scene(scene) as opened:
+        truth = drawn(opened.gaussians(2))
+    back = read_gaussians(tmp_path / "a.ply")
+    assert all(np.array_equal(getattr(back, name), getattr(truth, name)) for name in ATTRIBUTES)
+
+
+def test_the_format_is_asked_for_or_told_by_the_name(scene, tmp_path):
+    for name in ("a.ply", "a.compressed.ply", "a.spz"):
+        assert run("export", scene, "--frame", 0, "-o", tmp_path / name) == OK
+    assert run("export", scene, "--frame", 0, "--format", "spz", "-o", tmp_path / "b.dat") == OK
+    assert (tmp_path / "b.dat").read_bytes() == (tmp_path / "a.spz").read_bytes()
+    assert (tmp_path / "a.compressed.ply").read_bytes() != (tmp_path / "a.ply").read_bytes()
+    assert len({len(read_gaussians(path)) for path in tmp_path.glob("a.*")}) == 1
+
+
+def test_a_sequence_goes_out_and_comes_back(scene, tmp_path, capsys):
+    assert run("export", scene, "--frames", ":", "-o", tmp_path / "frames") == OK
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["000000.ply", "000001.ply", "000002.ply"]
+    assert run("export", scene, "--frames", "1:3", "-o", tmp_path / "frames") == WRONG
+    assert "must be new or an empty folder" in capsys.readouterr().err
+    assert run("export", scene, "--frames", "1:4", "-o", tmp_path / "more") == WRONG
+    assert run("import", tmp_path / "frames", "--fps", "30000/1001", "-o", tmp_path / "b.mkv", "--json") == OK
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["frames"], facts["gaussians"], facts["undrawn"]) == (3, 90 + 90 + 86, 0)
+    assert facts["kept_share"] <= 1
+    assert len(facts["psnr_db"]) == 18
+    with open_scene(tmp_path / "b.mkv") as back, open_scene(scene) as first:
+        assert back.header.rate == Fraction(30000, 1001)
+        a, b = drawn(first.gaussians(2)), drawn(back.gaussians(2))
+        if facts["pruned"] == 0:
+            order = [np.lexsort(g.means.T) for g in (a, b)]
+            # Half a step of 16 bits on a scale of about this scene's size.
+            assert np.abs(a.means[order[0]] - b.means[order[1]]).max() < 1e-3
+    assert run("import", tmp_path / "frames", "--keep-all", "-o", tmp_path / "c.mkv") == OK
+    assert "the UV map has no texel for 0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("to", "file"), [("colmap", "images.txt"), ("transforms", "transforms.json")])
+def test_cameras_go_out_and_come_back(tmp_path, to, file):
+    scene = write_small_scene(tmp_path / "a.mkv", square=False)
+    assert run("export", "cameras", scene, "--to", to, "-o", tmp_path / "rig") == OK
+    assert (tmp_path / "rig" / file).is_file()
+    assert_same_cameras(load_rig(tmp_path / "rig", ["a", "b"]), square=False)
+
+
+def assert_same_cameras(rig, *, square):
+    for camera in cameras(square):
+        back = rig[camera.name]
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):
+            assert getattr(back, name) == getattr(camera, name)
+        assert np.allclose(back.camera_from_world, camera.camera_from_world, rtol=0, atol=1e-12)  # roundings near 1
+
+
+def test_llff_gets_rows_by_name_and_depths_of_what_is_seen(scene, tmp_path, capsys):
+    assert run("export", "cameras", scene, "--to", "poses-bounds", "-o", tmp_path / "llff") == OK
+    assert_same_cameras(load_rig(tmp_path / "llff", ["a", "b"]), square=True)
+    rows = np.load(tmp_path / "llff" / "poses_bounds.npy")
+    assert rows[:, 4].tolist() == [48, 48]
+    assert rows[:, 14].tolist() == [55.5, 60.25]  # a, then b
+    near, far = rows[:, 15:].T
+    assert ((near > 2.5) & (near < 4.5) & (far > 5.5) & (far < 7.5)).all()  # 5 away, 2 in each direction
+    other = write_small_scene(tmp_path / "a.mkv", square=False)
+    assert run("export", "cameras", other, "--to", "poses-bounds", "-o", tmp_path / "no") == WRONG
+    assert "write COLMAP or transforms.json instead" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
+
+
+def test_the_atlas_is_a_picture_and_a_video(scene, tmp_path, capsys):
+    assert run("atlas", scene, "--frame", 1, "--map", 64, "--layers", 4, "-o", tmp_path / "a.png") == OK
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (3 * 104, 264, 3)
+    assert run("atlas", scene, "--frame", 1, "--map", 64, "--triplet", "scale", "-o", tmp_path / "b.png") == OK
+    assert cv2.imread(str(tmp_path / "b.png")).shape == (64, 128, 3)
+    assert run("atlas", scene, "--frame", 3, "-o", tmp_path / "c.png") == WRONG
+    assert "frames 0 to 2, but frame 3" in capsys.readouterr().err
+    assert run("export", "atlas", scene, "--map", 64, "-o", tmp_path / "a.mkv", "--json") == OK
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["exact"]
+    assert facts["frames"] == len(AtlasVideo(tmp_path / "a.mkv")) == 3
+    assert run("import", tmp_path / "a.mkv", "-o", tmp_path / "back.mkv") == OK
+    assert "all 3 frames are the integers that the atlas was made from" in capsys.readouterr().out
+    words = ["export", "atlas", scene, "--codec", "x264", "--crf", 30, "--map", 64, "-o", tmp_path / "b.mkv"]
+    assert run(*words) == OK
+    assert "rms in steps: position_hi 0.00" in capsys.readouterr().out
+
+
+def test_nothing_is_left_behind_by_what_fails(scene, tmp_path):
+    (tmp_path / "junk.ply").write_bytes(b"ply\n")
+    assert run("import", tmp_path / "junk.ply", "-o", tmp_path / "a.mkv") == WRONG
+    assert run("export", scene, "--frame", 9, "-o", tmp_path / "a.ply") == WRONG
+    assert run("export", scene, "--frame", 0, "-o", tmp_path / "none" / "a.ply") == WRONG
+    assert [path.name for path in tmp_path.iterdir()] == ["junk.ply"]

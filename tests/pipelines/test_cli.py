@@ -1,0 +1,147 @@
+"""The `packuv` command: grammar, exit codes, one sentence per error."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+
+import pytest
+
+from pipelines import cli
+from pipelines.cli import FAILED, INTERRUPTED, OK, WRONG, main, parser
+from pipelines.commands.run import request_from
+from pipelines.request import RunRequest, read_settings
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["frob"], "invalid choice: 'frob'"),
+        (["run", "capture"], "the following arguments are required: --out"),
+        (["run", "capture", "--out", "o", "--preset", "best"], "invalid choice: 'best'"),
+        (["run", "capture", "--out", "o", "--frames", "3:1"], "must be A:B with A < B, as 0:30"),
+        (["run", "capture", "--out", "o", "--frames", "three"], "must be A:B with A < B"),
+        (["run", "capture", "--out", "o", "--jobs", "0"], "must be a whole number from 1 on, but is '0'"),
+        (["run", "capture", "--out", "o", "--unknown"], "unrecognized arguments: --unknown"),
+        (["run", "capture", "--out", "o", "--dir"], "unrecognized arguments: --dir"),
+        (["sync", "capture", "--out", "o", "--stop-after", "fit"], "unrecognized arguments: --stop-after fit"),
+        (["simulate", "out", "--size", "640"], "must be WIDTHxHEIGHT in pixels"),
+        (["export"], "the following arguments are required: WHAT; see packuv export --help"),
+        (["export", "nowhere.mkv", "-o", "a.ply"], "one of the arguments --frame --frames is required"),
+        (["export", "nowhere.mkv", "--frame", "0", "-o", "a.ply"], "nowhere.mkv"),
+        (["export", "frames", "nowhere.mkv", "--frame", "0", "-o", "a.txt"], "a.txt does not tell its format"),
+        (["export", "cameras", "a.mkv", "-o", "out"], "the following arguments are required: --to"),
+        (["export", "atlas", "a.mkv", "-o", "b.mkv", "--codec", "ffv1", "--crf", "9"], "ffv1 is always lossless"),
+        (["export", "atlas", "a.mkv", "-o", "b.mkv", "--lossless", "--crf", "9"], "not allowed with argument"),
+        (["export", "atlas", "a.mkv", "-o", "b.mkv", "--map", "100"], "choose multiples"),
+        (["import", "nowhere.ply", "-o", "a.mkv"], "no splat file or folder nowhere.ply"),
+        (["import", "a.ply", "--fps", "0", "-o", "a.mkv"], "must be a rate above 0 as 30, 29.97 or 30000/1001"),
+        (["atlas", "nowhere.mkv", "--frame", "0", "-o", "a.png"], "nowhere.mkv"),
+        (["web", "nowhere.mkv", "-o", "site"], "nowhere.mkv"),
+        (["verify"], "one of the arguments SCENE --store is required"),
+        (["run", "nowhere", "--out", "o"], "no capture folder nowhere"),
+        (["run", "nowhere", "--out", "o", "--set", "fit.iterations"], "--set needs NAME=VALUE"),
+        (["run", "nowhere", "--out", "o", "--config", "none.toml"], "no file none.toml; --config needs a TOML file"),
+        (["info", "nowhere.mkv"], "nowhere.mkv"),
+        (["verify", "--store", "nowhere"], "no folder nowhere"),
+    ],
+)
+def test_wrong_usage_is_one_sentence_and_code_2(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == WRONG
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert message in captured.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "",
+        *cli.SINGLE,
+        *("run", "simulate", "info", "verify", "render", "eval", "view", "import", "atlas", "web"),
+        *("export", "export frames", "export cameras", "export atlas"),
+    ],
+)
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as leaving:
+        main([*command.split(), "--help"])
+    assert leaving.value.code == OK
+    text = capsys.readouterr().out
+    assert f"usage: packuv {command}".strip() in text
+    assert "None" not in text
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys; from pipelines.cli import parser; parser(); print(*sys.modules)"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numpy", "torch", "numba", "prefect", "av", "cv2", "pyarrow"} & set(modules)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (ValueError("the video ends early"), WRONG, r"packuv: the video ends early\n"),
+        (FileNotFoundError("no video cam03.mp4"), WRONG, r"packuv: no video cam03\.mp4\n"),
+        (PermissionError(13, "Permission denied", "runs"), WRONG, r"packuv: Permission denied: runs\n"),
+        (KeyboardInterrupt(), INTERRUPTED, r"packuv: stopped; the same command goes on from here\n"),
+        (TypeError("a bug\nin two lines"), FAILED, r"packuv: a bug in two lines; the traceback is in (\S+)\n"),
+        (OSError(28, "No space left on device"), FAILED, r"packuv: No space left on device\n"),
+        (OSError(5, "Input/output error", "a.mp4"), FAILED, r"packuv: Input/output error: a\.mp4\n"),
+    ],
+)
+def test_every_failure_is_one_line_and_a_code(error, code, message, capsys, monkeypatch, tmp_path):
+    def fails(arguments):
+        raise error
+
+    monkeypatch.setattr(cli, "_load", lambda name: fails)
+    monkeypatch.setattr(cli.tempfile, "tempdir", str(tmp_path))
+    assert main(["doctor"]) == code
+    found = re.fullmatch(message, capsys.readouterr().err)
+    assert found
+    if found.groups():
+        log = next(tmp_path.iterdir())
+        assert str(log) == found[1]
+        assert "Traceback" in log.read_text()
+
+
+def test_arguments_become_a_request(tmp_path):
+    config = tmp_path / "settings.toml"
+    config.write_text("[fit]\niterations = 100\nsh_degree = 1\n[keyframes]\nmin_separation = 9\n")
+    words = ["fit", "capture", "--out", "runs", "--preset", "draft", "--frames", ":30", "--hold-out", "cam05, cam14"]
+    words += ["--config", str(config), "--set", "fit.iterations=500", "--set", "fit.density.cap=9", "--jobs", "2"]
+    assert request_from(parser().parse_args(words)) == RunRequest(
+        capture="capture",
+        out="runs",
+        preset="draft",
+        settings={
+            "fit": {"iterations": "500", "sh_degree": 1, "density": {"cap": "9"}},
+            "keyframes": {"min_separation": 9},
+        },
+        frames=(0, 30),
+        hold_out=("cam05", "cam14"),
+        stop_after="fit",
+        jobs=2,
+    )
+
+
+def test_settings_name_their_file_and_their_clashes(tmp_path):
+    config = tmp_path / "settings.toml"
+    config.write_text("fit = 3\n")
+    with pytest.raises(ValueError, match=r"fit\.cap: fit is set to a value elsewhere, but is a table here"):
+        read_settings(config, ["fit.cap=3"])
+    config.write_text("[fit")
+    with pytest.raises(ValueError, match=r"settings\.toml is no valid TOML"):
+        read_settings(config, [])
+
+
+def test_help_is_fast():
+    start = time.monotonic()
+    subprocess.run([sys.executable, "-c", "from pipelines.cli import main; main(['--help'])"], capture_output=True)
+    # 0.2 s on a quiet machine; a heavy import would take seconds, a busy machine takes a few times more
+    assert time.monotonic() - start < 3

@@ -1,0 +1,69 @@
+"""Settings of a run: who wins over whom, and what is refused."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from packuv.scene.encoder import TOLERANCES, Quality
+from packuv.scene.stream import Tolerance
+from pipelines.options import SequenceOptions, compose
+from pipelines.request import PRESETS, RunRequest
+from sync.capture import CaptureSettings
+from sync.clock import ClockMode
+from tasks.artefacts.recipe import OptionError, canonical, plain, restore
+
+CAPTURE = CaptureSettings(reference="cam03", clock=ClockMode.TRIGGERED)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_make_whole_options_that_survive_json(preset):
+    options = compose(preset, CaptureSettings(), {})
+    assert restore(SequenceOptions, plain(options)) == options
+
+
+def test_presets_differ_and_go_up():
+    efforts = [compose(preset, CaptureSettings(), {}).fit.iterations for preset in PRESETS]
+    assert efforts == sorted(set(efforts))
+    assert len({canonical(compose(preset, CaptureSettings(), {})) for preset in PRESETS}) == len(PRESETS)
+
+
+def test_the_user_wins_over_the_capture_and_that_over_the_preset():
+    options = compose("draft", CAPTURE, {}, seed=7)
+    assert (options.sync.reference, options.sync.clock, options.fit.seed) == ("cam03", ClockMode.TRIGGERED, 7)
+    options = compose("draft", CAPTURE, {"sync": {"reference": "cam01"}, "fit": {"iterations": "12"}})
+    assert (options.sync.reference, options.sync.clock, options.fit.iterations) == ("cam01", ClockMode.TRIGGERED, 12)
+    assert options.fit.key_iterations == compose("draft", CAPTURE, {}).fit.key_iterations
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"fitt": {"iterations": 1}}, r"unknown option fitt; valid here: pictures, sync, rig, points, motion"),
+        ({"fit": {"iteration": 1}}, r"unknown option fit\.iteration; valid here: iterations, key_iterations"),
+        ({"fit": {"density": {"caps": 1}}}, r"unknown option fit\.density\.caps; valid here: "),
+        ({"fit": {"iterations": "many"}}, r"fit\.iterations must be a whole number, but is 'many'"),
+        ({"fit": 3}, r"fit must be a table of iterations, .*, but is 3"),
+        ({"motion": {"evidence": "guess"}}, r"motion\.evidence must be one of change, flow, but is 'guess'"),
+        ({"pictures": {"max_width": "3"}}, r"pictures: max_width must be at least 16 pixels, but is 3"),
+    ],
+)
+def test_wrong_settings_are_named_by_their_path(settings, message):
+    with pytest.raises(OptionError) as caught:
+        compose("draft", CaptureSettings(), settings)
+    assert re.match(message, str(caught.value)), str(caught.value)
+
+
+def test_a_request_refuses_what_does_not_exist():
+    with pytest.raises(ValueError, match="preset must be one of draft, standard, high, but is 'best'"):
+        RunRequest("capture", "out", preset="best")
+
+
+def test_quality_sets_the_tolerance_of_the_scene_file_and_settings_win_over_it():
+    assert compose("draft", CAPTURE, {}).encode.tolerance.exact
+    assert compose("draft", CAPTURE, {}, quality="high").encode.tolerance == TOLERANCES[Quality.HIGH]
+    set_by_hand = {"encode": {"tolerance": {"position": 3}}}
+    assert compose("draft", CAPTURE, set_by_hand, quality="low").encode.tolerance == Tolerance(3, 4)
+    with pytest.raises(ValueError, match="quality must be one of lossless, high, medium, low, but is 'ultra'"):
+        RunRequest("capture", "out", quality="ultra")

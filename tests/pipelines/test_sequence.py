@@ -1,0 +1,288 @@
+"""Whole runs on a tiny synthetic capture: what they leave, what they do again, and what a kill costs."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from packuv.scene import open_scene
+from pipelines.cli import main
+from pipelines.commands.progress import TerminalProgress
+from pipelines.events import Journal
+from pipelines.process import Outcome, process, process_directly
+from pipelines.request import RunRequest
+from studio.capture import SimulateOptions, TruthKind, simulate
+from studio.clocks import ClockOptions
+from tasks.artefacts.store import Store
+
+FRAMES = 6
+SETTINGS: dict[str, Any] = {
+    "keyframes": {"separation": 2, "max_segment": 3},
+    "fit": {
+        "iterations": 20,
+        "key_iterations": 8,
+        "frame_iterations": 4,
+        "spare": 40,
+        "key_births": 40,
+        "start": {"count": 300},
+        "density": {"cap": 400},
+    },
+}
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("captures") / "tiny"
+    clock = ClockOptions(drop_share=0, max_late_frames=0)
+    simulate(
+        folder, SimulateOptions(5, FRAMES, "96x64", seed=3, samples=1, clock=clock, truth=TruthKind.LIGHT, name="tiny")
+    )
+    return folder
+
+
+def request(capture: Path, out: Path, **changes: Any) -> RunRequest:
+    return RunRequest(**{"capture": str(capture), "out": str(out), "preset": "draft", "settings": SETTINGS, **changes})
+
+
+def run(asked: RunRequest) -> tuple[Outcome, str]:
+    stream = io.StringIO()
+    return process_directly(asked, Journal(TerminalProgress(stream))), stream.getvalue()
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def first(capture, tmp_path_factory) -> tuple[Outcome, str]:
+    """An uninterrupted run."""
+    return run(request(capture, tmp_path_factory.mktemp("runs")))
+
+
+def artefacts(outcome: Outcome) -> dict[str, str]:
+    """What each stage of a run made or found."""
+    return {event.label: str(event.key) for event in outcome.events if event.key}
+
+
+def made(outcome: Outcome) -> set[str]:
+    """Stages that had to work."""
+    return {event.label for event in outcome.events if event.outcome == "made" and event.key}
+
+
+def test_run_leaves_scene_report_and_record(first, capture):
+    outcome, said = first
+    with open_scene(outcome.scene) as scene:
+        assert len(scene) == FRAMES
+        assert [camera.name for camera in scene.header.cameras] == [f"cam{n:02d}" for n in range(1, 6)]
+        assert scene.header.held_out == ("cam03",)
+    record = json.loads((outcome.folder / "run.json").read_text())
+    report = json.loads((outcome.folder / "report.json").read_text())
+    assert report["summary"]["scored_cameras"] == ["cam03"]
+    assert report["summary"]["verified"] is True
+    assert record["options"]["fit"]["iterations"] == 20
+    assert record["cameras"]["held_out"] == ["cam03"]
+    why = "calibration/ holds a COLMAP model"
+    assert {"what": "COLMAP", "why": why} in record["skipped"]
+    assert why in said
+    assert why in (outcome.folder / "report.json").read_text()
+    assert Store(outcome.folder / "store").verify() == []
+    assert not [path for path in (outcome.folder / "store" / ".work").iterdir() if path.is_dir()]
+    assert outcome.scene.stat().st_nlink == 2
+
+
+def test_info_and_verify_tell_what_the_scene_is(first, capsys, tmp_path):
+    scene = first[0].scene
+    assert main(["info", str(scene), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["frames"], facts["lossless"], facts["held_out"]) == (FRAMES, True, ["cam03"])
+    assert main(["verify", str(scene)]) == 0
+    assert "all 6 frames decode to exactly what was written" in capsys.readouterr().out
+    damaged = tmp_path / "damaged.mkv"
+    data = bytearray(scene.read_bytes())
+    data[len(data) // 2] ^= 1
+    damaged.write_bytes(data)
+    assert main(["verify", str(damaged), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["bad"]
+    assert found["span"][0] <= len(data) // 2 < found["span"][1]
+
+
+def test_same_command_finds_everything_there(first, capture):
+    outcome, _ = first
+    before = sha256(outcome.scene)
+    again, _ = run(request(capture, outcome.folder.parent))
+    assert made(again) == set()
+    assert artefacts(again) == artefacts(outcome)
+    assert sha256(again.scene) == before
+
+
+def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
+    outcome, _ = first
+    out = outcome.folder.parent
+
+    def redone(**settings: Any) -> set[str]:
+        merged = {**SETTINGS, **settings}
+        return {label.split(" ")[0] for label in made(run(request(capture, out, settings=merged))[0])}
+
+    shorter = {**SETTINGS["fit"], "frame_iterations": 3}
+    found = made(run(request(capture, out, settings={**SETTINGS, "fit": shorter}))[0])
+    assert {label for label in found if label.startswith("fit")} == {"fit 0-2", "fit key 3 after 2", "fit 3-5"}
+    assert {label for label in found if not label.startswith("fit")} == {"encode", "verify", "evaluate"}
+    assert redone(evaluate={"fitted_cameras": 2}) == {"evaluate"}
+    assert redone() == set()  # back to what was there at first
+
+
+def seam_of(outcome: Outcome) -> float:
+    """Flicker at the scene's border over that elsewhere, for the camera that was held out."""
+    metrics = outcome.folder / "store" / artefacts(outcome)["evaluate"] / "metrics.json"
+    return json.loads(metrics.read_text())["seam"]
+
+
+def test_side_by_side_a_border_that_shows_is_fitted_again_from_the_frame_before_it(first, capture, tmp_path):
+    outcome, _ = first
+    shutil.copytree(outcome.folder / "store", tmp_path / "tiny" / "store")
+
+    def fitted(limit: float) -> tuple[set[str], Outcome]:
+        settings = {**SETTINGS, "keyframes": {**SETTINGS["keyframes"], "seam": limit}}
+        found, _ = run(request(capture, tmp_path, settings=settings, jobs=2))
+        return {label for label in made(found) if label.startswith("fit")}, found
+
+    fits, apart = fitted(0)
+    assert fits == {"fit key 3", "fit 3-5"}  # what comes first is the same, one at a time or side by side
+    fits, mended = fitted(1.01)
+    assert fits == set()  # what goes on from the frame before is what one at a time makes
+    assert artefacts(mended)["fit 3-5"] == artefacts(outcome)["fit 3-5"] != artefacts(apart)["fit 3-5"]
+    assert seam_of(mended) < seam_of(apart)
+
+
+def test_a_full_disk_is_refused_before_the_work(first, capture, tmp_path, monkeypatch):
+    outcome, _ = first
+    usage = shutil.disk_usage(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
+        with pytest.raises(
+            OSError, match=r"needs about .* GB under .*store, but 0\.0 GB are free; choose another --out"
+        ):
+            run(request(capture, outcome.folder.parent))
+
+
+def test_an_earlier_stop_and_another_seed(first, capture):
+    outcome, _ = first
+    out = outcome.folder.parent
+    stopped, _ = run(request(capture, out, stop_after="flow", seed=1))
+    assert made(stopped) == set()  # nothing before the fit reads the seed
+    assert stopped.scene is None
+    assert set(artefacts(stopped)) == {"sync", "rig", "points", "flow", "keyframes"}
+
+
+def test_flow_shows_what_was_skipped(workflow, first, capture):
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.sorting import TaskRunSort
+
+    from pipelines.sequence import run_flow
+
+    outcome, _ = first
+    for part in (outcome.folder / "store" / "evaluate").iterdir():
+        for file in part.rglob("*.json"):
+            file.unlink()
+    again = run_flow(request(capture, outcome.folder.parent), Journal(TerminalProgress(io.StringIO())))
+    assert artefacts(again) == artefacts(outcome)
+    assert made(again) == {"evaluate"}
+    with get_client(sync_client=True) as client:
+        runs = client.read_task_runs(sort=TaskRunSort.EXPECTED_START_TIME_DESC, limit=len(artefacts(again)))
+    states = {item.name.rsplit("-", 1)[0]: item.state_name for item in runs}
+    assert states["evaluate"] == "Completed"
+    assert {state for stage, state in states.items() if stage != "evaluate"} == {"Skipped"}
+
+
+def test_bad_input_in_a_stage_is_named_and_not_retried(workflow, capture, tmp_path):
+    from pipelines.sequence import run_flow
+
+    broken = tmp_path / "broken"
+    (broken / "videos").mkdir(parents=True)
+    for path in (capture / "videos").iterdir():
+        (broken / "videos" / path.name).write_bytes(path.read_bytes()[: 400 if path.stem == "cam02" else None])
+    progress = Journal(TerminalProgress(io.StringIO()))
+    with pytest.raises(ValueError, match=r"cam02\.mp4"):
+        run_flow(request(broken, tmp_path / "out"), progress)
+    assert [(event.label, event.outcome) for event in progress.events] == [("sync", "failed")]
+    record = json.loads((tmp_path / "out" / "broken" / "run.json").read_text())
+    assert record["stages"][-1]["outcome"] == "failed"
+    assert "cam02.mp4" in record["stages"][-1]["reason"]
+
+
+@pytest.mark.parametrize(("mode", "kills"), [("--direct", 3), ("", 1)], ids=["direct", "prefect"])
+def test_killed_runs_end_with_the_same_bytes(first, capture, tmp_path, mode, kills):
+    outcome, _ = first
+    settings = tmp_path / "settings.json"
+    settings.write_text(json.dumps(SETTINGS))
+    words = ["run", str(capture), "--out", str(tmp_path / "out"), "--preset", "draft", *_as_words(SETTINGS)]
+    command = [sys.executable, "-m", "pipelines.cli", *words, *([mode] if mode else [])]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT")}
+    rng = random.Random(7)
+    for _ in range(kills):
+        with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) as killed:
+            try:
+                killed.wait(timeout=rng.uniform(6, 30))
+            except subprocess.TimeoutExpired:
+                killed.send_signal(signal.SIGKILL)
+    last = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert last.returncode == 0, last.stderr
+    assert sha256(tmp_path / "out" / "tiny" / "scene.mkv") == sha256(outcome.scene)
+    assert Store(tmp_path / "out" / "tiny" / "store").verify() == []
+
+
+def _as_words(settings: dict[str, Any], path: str = "") -> list[str]:
+    words: list[str] = []
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            words += _as_words(value, f"{path}{name}.")
+        else:
+            words += ["--set", f"{path}{name}={value}"]
+    return words
+
+
+def test_a_run_that_stops_leaves_the_finished_segments_as_a_scene_that_plays(first, capture, tmp_path):
+    outcome, _ = first
+    store = tmp_path / "tiny" / "store"
+    shutil.copytree(outcome.folder / "store", store)
+    for stage in ("segment", "encode", "verify", "evaluate"):
+        shutil.rmtree(store / stage)
+    asked, partial, started = request(capture, tmp_path), tmp_path / "tiny" / "scene.partial.mkv", []
+    with ThreadPoolExecutor(max_workers=2) as pool:
+
+        def stop_at(stage: str, count: int):
+            def submit(function, *arguments):
+                started.append(function.__name__)
+                if started.count(stage) == count:
+                    raise KeyboardInterrupt
+                future = pool.submit(function, *arguments)
+                if stage == "encode":
+                    future.result()
+                return future
+
+            return submit
+
+        with pytest.raises(KeyboardInterrupt):
+            process(asked, Journal(TerminalProgress(io.StringIO())), stop_at("fit_segment", 1))
+        assert not partial.exists()
+        with pytest.raises(KeyboardInterrupt):
+            process(asked, Journal(TerminalProgress(io.StringIO())), stop_at("encode", 1))
+    with open_scene(partial) as scene:
+        assert len(scene) == FRAMES
+    whole, _ = run(asked)
+    assert sha256(whole.scene) == sha256(outcome.scene)
+    assert not partial.exists()

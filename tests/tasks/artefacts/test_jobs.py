@@ -1,0 +1,173 @@
+"""Jobs: arguments and results, exceptions, death in both directions."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from tasks.artefacts.jobs import CancelledError, JobDiedError, JobError, Jobs, end_leftovers
+from tasks.artefacts.store import Store
+from tasks.artefacts.workshop import Workshop
+
+WORK = """
+from __future__ import annotations
+import os, signal, subprocess, sys, time
+from dataclasses import dataclass
+from pathlib import Path
+
+@dataclass(frozen=True)
+class Size:
+    width: int
+    height: int = 2
+
+class CaptureError(ValueError):
+    pass
+
+def area(size: Size, names: tuple[str, ...], out: Path, progress):
+    progress(1, 2, "half")
+    (out / "area.txt").write_text(str(size.width * size.height))
+    return {"names": list(names), "threads": os.environ["NUMBA_NUM_THREADS"], "pid": os.getpid()}
+
+def bad_input(): raise CaptureError("cam03 has no frames")
+def missing(): raise FileNotFoundError(2, "no such thing", "cam03.mp4")
+def full(): raise OSError(28, "No space left on device")
+def bug(): return {}["key"]
+def dies(): os.kill(os.getpid(), signal.SIGKILL)
+def says(): print("said by the job"); sys.stdout.flush(); sys.exit(3)
+
+def sleeps(mark: Path):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    mark.write_text(f"{os.getpid()} {child.pid}")
+    time.sleep(60)
+"""
+
+
+class Quiet:
+    """Remembers what a workshop told."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple] = []
+
+    def __getattr__(self, name: str):
+        return lambda *values: self.events.append((name, *values))
+
+
+@pytest.fixture
+def jobs(tmp_path, monkeypatch):
+    (tmp_path / "packuv_test_work.py").write_text(WORK)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return Jobs(threads=3)
+
+
+def gone(pid: int, *, seconds: float = 5) -> bool:
+    """True once the process has ended; a zombie whose new parent has not looked yet counts as ended."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        with contextlib.suppress(FileNotFoundError):
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
+                time.sleep(0.02)
+                continue
+        return True
+    return False
+
+
+def read_pids(mark: Path) -> list[int]:
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        if mark.exists() and len(mark.read_text().split()) == 2:
+            return [int(pid) for pid in mark.read_text().split()]
+        time.sleep(0.02)
+    raise AssertionError("the job did not start")
+
+
+def test_arguments_results_and_progress_cross_over(jobs, tmp_path):
+    seen = []
+    arguments = {"size": {"width": 3}, "names": ("cam00", "cam01"), "out": tmp_path, "scratch": tmp_path}
+    done = jobs.run("packuv_test_work:area", arguments, folder=tmp_path, progress=lambda *values: seen.append(values))
+    assert (tmp_path / "area.txt").read_text() == "6"
+    assert seen == [(1.0, 2.0, "half")]
+    assert done.value["names"] == ["cam00", "cam01"]
+    assert done.value["threads"] == "3"
+    assert done.value["pid"] != os.getpid()
+    assert done.peak_memory_bytes > 1 << 20
+
+
+@pytest.mark.parametrize(
+    ("function", "kind", "message"),
+    [
+        ("bad_input", ValueError, r"^cam03 has no frames(\n|$)"),
+        ("missing", FileNotFoundError, r"no such thing: 'cam03\.mp4'"),
+        ("full", OSError, "No space left on device"),
+        ("bug", JobError, r"^KeyError: key; the traceback is in .*job\.log$"),
+        ("dies", JobDiedError, r"ended without a result \(killed by signal 9, as happens when memory runs out\)"),
+        ("says", JobDiedError, r"ended without a result \(exit code 3\)"),
+    ],
+)
+def test_failures_keep_their_kind_and_words(jobs, tmp_path, function, kind, message):
+    with pytest.raises(kind, match=message) as caught:
+        jobs.run(f"packuv_test_work:{function}", {}, folder=tmp_path)
+    assert isinstance(caught.value, JobDiedError) == (kind is JobDiedError)
+    log = (tmp_path / "job.log").read_text()
+    assert {"bug": "Traceback", "says": "said by the job"}.get(function, "") in log
+
+
+def test_cancel_ends_jobs_and_what_they_started(jobs, tmp_path):
+    mark, caught = tmp_path / "mark", []
+
+    def run():
+        with pytest.raises(CancelledError, match="the same command goes on from here"):
+            jobs.run("packuv_test_work:sleeps", {"mark": mark}, folder=tmp_path)
+        caught.append(True)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    pids = read_pids(mark)
+    jobs.cancel()
+    thread.join(timeout=10)
+    assert caught == [True]
+    assert all(gone(pid) for pid in pids)
+    with pytest.raises(CancelledError):
+        jobs.run("packuv_test_work:dies", {}, folder=tmp_path)
+
+
+def test_job_dies_with_its_parent(jobs, tmp_path):
+    mark = tmp_path / "mark"
+    code = (
+        "import sys; from pathlib import Path; from tasks.artefacts.jobs import Jobs\n"
+        "folder = Path(sys.argv[1])\n"
+        "Jobs(threads=1).run('packuv_test_work:sleeps', {'mark': folder / 'mark'}, folder=folder)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) as parent:
+        job, grandchild = read_pids(mark)
+        parent.send_signal(signal.SIGKILL)
+    assert gone(job)
+    assert not gone(grandchild, seconds=0.2)  # the kernel's help does not reach further than the job ...
+    end_leftovers(tmp_path)
+    assert gone(grandchild)  # ... but the next job in this folder begins alone
+
+
+def test_workshop_makes_an_artefact_by_a_job_and_tells(jobs, tmp_path):
+    listener = Quiet()
+    workshop = Workshop(Store(tmp_path / "store"), jobs, listener)
+    arguments = {"size": {"width": 3}, "names": ("cam00",)}
+    for _ in range(2):
+        key = workshop.make("fit", 1, {"width": 3}, {}, "packuv_test_work:area", arguments, label="fit 1")
+    assert key.reused
+    assert (workshop.path(key) / "area.txt").read_text() == "6"
+    assert workshop.store.receipt(key).notes["names"] == ["cam00"]
+    names = [event[0] for event in listener.events]
+    assert names == ["started", "moved", "finished", "started", "finished"]
+    with pytest.raises(ValueError, match="no frames"):
+        workshop.make("fit", 1, {}, {}, "packuv_test_work:bad_input", {}, label="fit 2")
+    assert listener.events[-1][:2] == ("failed", "fit 2")
+    spec = json.loads((workshop.store.workspace(workshop.store.key("fit", 1, {}, {})) / "spec.json").read_text())
+    assert spec["function"] == "packuv_test_work:bad_input"

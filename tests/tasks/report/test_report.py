@@ -1,0 +1,449 @@
+"""The report: every section is there, with data and without; what is bad is said; nothing is loaded from elsewhere."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+from dataclasses import replace
+from fractions import Fraction
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from calibration.accept import check_rig
+from calibration.rig import Camera, Rig
+from sync.align import CameraReport, SyncReport
+from sync.clock import Clock, ClockMode, ClockState
+from tasks.report.facts import MAX_PSNR_DB
+from tasks.report.page import SECTIONS, duration, page_text
+from tasks.report.plots import Series, Volume, bar_chart, line_chart, rig_axes, rig_views
+from tasks.report.record import summary
+from tasks.report.write import (
+    Comparison,
+    FrameScore,
+    MotionCurve,
+    ReportInput,
+    SceneFigures,
+    StageOutcome,
+    StageRecord,
+    findings,
+    frames_to_picture,
+    scene_figures,
+    write_report,
+)
+
+FRAMES = 12
+HELD_OUT = ("cam1", "cam4")
+
+
+def make_rig(count: int = 6) -> Rig:
+    """A ring about the origin that looks inwards; z is up."""
+    cameras = []
+    for index, angle in enumerate(np.arange(count) * 2 * np.pi / count):
+        eye = 3 * np.array([np.cos(angle), np.sin(angle), 0.1])
+        forward = -eye / np.linalg.norm(eye)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = [right, np.cross(forward, right), forward]
+        pose[:3, 3] = -pose[:3, :3] @ eye
+        gains = (1.0 + 0.02 * index, 1.0, 1.0)
+        cameras.append(Camera(f"cam{index}", 320, 240, 260.0, 260.0, 160.0, 120.0, pose, gains=gains))
+    return Rig(tuple(cameras), "a ring", metric=True)
+
+
+def make_sync(**changes: object) -> SyncReport:
+    clock = Clock(ClockState.TRUSTED, 0, 1_200_000.0, 9_000.0, 12.0, 1.0, 40_000.0)
+    row = CameraReport(
+        "cam0", FRAMES, 0, 0, 0, 0, 0, FRAMES * 33_000_000, 33_333_333, FRAMES, 1.0, clock, 9e5, 2e6, (0, 1, 9, 2, 0)
+    )
+    rows = [replace(row, camera=f"cam{index}") for index in range(6)]
+    rows[3] = replace(rows[3], **changes)  # type: ignore[arg-type]
+    return SyncReport("cam0", False, 33_333_333, 16_666_666, True, ClockMode.TRUSTED, FRAMES, FRAMES - 1, tuple(rows))
+
+
+def make_scores(level_db: float = 26.0) -> tuple[FrameScore, ...]:
+    return tuple(
+        FrameScore(camera, frame, level_db - 0.1 * frame - index, 0.9 - 0.01 * frame)
+        for index, camera in enumerate(HELD_OUT)
+        for frame in range(FRAMES)
+    )
+
+
+def make_scene() -> SceneFigures:
+    sizes = tuple(900_000 if frame in (0, 7) else 50_000 for frame in range(FRAMES))
+    return SceneFigures("scene.mkv", sum(sizes) + 12_345, Fraction(30), sizes, (5000,) * 12, (800,) * 12, True)
+
+
+def make_report() -> ReportInput:
+    rng = np.random.default_rng(2)
+    truth = rng.integers(0, 256, (90, 160, 3), dtype=np.uint8)
+    rig = make_rig()
+    return ReportInput(
+        "ring <test>",
+        command="packuv run 'a b' --out runs",
+        options={"fit": {"iterations": 10, "share": 0.5}},
+        versions={"packuv": "0.1.0"},
+        host="a laptop",
+        finished="2026-11-22T12:00:00Z",
+        seconds=75.0,
+        sync=make_sync(),
+        rig=rig,
+        held_out=HELD_OUT,
+        check=check_rig(rig),
+        motion=MotionCurve(np.linspace(0, 2, FRAMES), (0, 7)),
+        scores=make_scores(),
+        scene=make_scene(),
+        pictures=(Comparison("cam1", 3, truth, truth, "first"),),
+        stages=(
+            StageRecord("sync", StageOutcome.MADE, 1.5, 200_000_000),
+            StageRecord("encode", StageOutcome.REUSED, 0.1),
+            StageRecord("COLMAP", StageOutcome.SKIPPED, 0.0, reason="a calibration is given & valid"),
+        ),
+    )
+
+
+class Page(HTMLParser):
+    """Checks that tags close in order; keeps ids, addresses and words."""
+
+    EMPTY = frozenset({"meta", "img", "link", "br", "line", "path", "rect", "circle"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.addresses: list[str] = []
+        self.words = ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        assert len(values) == len(attrs), f"an attribute twice in <{tag}>"
+        self.ids += [str(values["id"])] if "id" in values else []
+        self.addresses += [str(values[name]) for name in ("src", "href", "data", "action") if name in values]
+        if tag not in self.EMPTY:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in self.EMPTY:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in self.EMPTY or self.open[-1:] == [tag]:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words += data if "style" not in self.open and "script" not in self.open else ""
+
+
+def section(text: str, name: str) -> str:
+    found = re.search(rf'<section id="{name}">(.*?)</section>', text, re.DOTALL)
+    assert found
+    return found[1]
+
+
+# ---- the page
+
+
+def test_the_page_has_every_section_and_stands_alone() -> None:
+    text = page_text(make_report())
+    page = Page(text)
+    assert set(SECTIONS) | {"summary"} <= set(page.ids)
+    assert len(page.ids) == len(set(page.ids))
+    assert all(address.startswith(("#", "data:image/jpeg;base64,")) for address in page.addresses)
+    assert {address[1:] for address in page.addresses if address.startswith("#")} <= set(page.ids)
+    assert not re.search(r"url\(|@import|https?:|<link|<iframe", text)
+    for name in SECTIONS:
+        assert 'class="none"' not in section(text, name), name
+
+
+@pytest.mark.parametrize("missing", ["sync", "rig", "check", "motion", "scores", "scene", "pictures", "stages", "all"])
+def test_a_missing_part_says_so_and_spoils_nothing(missing: str, tmp_path: Path) -> None:
+    nothing = {name: None for name in ("sync", "rig", "check", "motion", "scene")}
+    nothing |= {name: () for name in ("scores", "pictures", "stages")}  # type: ignore[dict-item]
+    report = make_report()
+    report = ReportInput("empty") if missing == "all" else replace(report, **{missing: nothing[missing]})
+    files = write_report(report, tmp_path / "new")
+    text = files.page.read_text()
+    Page(text)
+    told = {name for name in SECTIONS if 'class="none"' in section(text, name)}
+    expected = {
+        "sync": {"sync"}, "rig": {"rig", "colour"}, "check": set(), "motion": {"motion"}, "scores": {"quality"},
+        "scene": {"size", "gaussians"}, "pictures": {"pictures"}, "stages": {"stages", "skipped"}, "all": set(SECTIONS),
+    }  # fmt: skip
+    assert told == expected[missing]
+    assert json.loads(files.json.read_text())["name"] == report.name
+
+
+def test_text_is_escaped() -> None:
+    report = make_report()
+    text = page_text(replace(report, command="<script>alert(1)</script>", host='"><img src=x>'))
+    assert "<script>alert" not in text
+    assert "<img src=x" not in text
+    assert "ring &lt;test&gt;" in text
+
+
+def test_the_summary_row_shows_the_figures() -> None:
+    words = Page(page_text(make_report())).words
+    scores = make_scores()
+    assert f"{np.mean([score.psnr_db for score in scores]):.2f} dB" in words
+    assert "1 min 15 s" in words
+    assert "cameras, 2 held out" in words
+    assert f"{(900_000 * 2 + 50_000 * 10 + 12_345) / 1e6 * 30 / 12:.2f} MB" in words
+
+
+# ---- report.json
+
+
+def test_json_holds_the_numbers(tmp_path: Path) -> None:
+    report = make_report()
+    data = json.loads(write_report(report, tmp_path).json.read_text())
+    assert SyncReport.from_json(data["sync"]) == report.sync
+    assert [FrameScore(**score) for score in data["scores"]] == list(report.scores)
+    assert data["cameras"][4]["held_out"] is True
+    assert np.allclose(data["cameras"][0]["centre"], make_rig().cameras[0].centre)
+    assert data["motion"] == {"magnitude_px": np.linspace(0, 2, FRAMES).tolist(), "keyframes": [0, 7]}
+    assert data["scene"]["frame_bytes"] == list(make_scene().frame_bytes)
+    assert data["summary"]["verified"] is True
+    assert data["findings"] == [{"section": item.section, "text": item.text} for item in findings(report)]
+
+
+def test_equal_pictures_stay_finite(tmp_path: Path) -> None:
+    report = replace(make_report(), scores=(FrameScore("cam1", 0, math.inf, 1.0),))
+    files = write_report(report, tmp_path)
+    assert json.loads(files.json.read_text())["scores"][0]["psnr_db"] == MAX_PSNR_DB
+    assert "inf" not in Page(files.page.read_text()).words.split()
+
+
+def test_a_report_replaces_the_one_before(tmp_path: Path) -> None:
+    write_report(make_report(), tmp_path)
+    write_report(ReportInput("second"), tmp_path)
+    assert "second" in (tmp_path / "report.html").read_text()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "report.json"]
+
+
+# ---- findings
+
+
+def texts(report: ReportInput) -> list[str]:
+    return [f"{item.section}: {item.text}" for item in findings(report)]
+
+
+def test_a_good_run_has_nothing_to_say() -> None:
+    assert texts(make_report()) == []
+    assert "No figure crosses its limit." in page_text(make_report())
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"matched_share": 0.71, "matched": 8}, "sync: cam3 has a frame at only 71% of the instants."),
+        ({"drops": 4}, "sync: cam3 dropped 4 of 16 frames."),
+        ({"residual_p95_ns": 12e6}, "sync: cam3: one frame in twenty is 0.36 frame periods or more off."),
+        ({"duplicates": 2}, "sync: cam3: 2 duplicate timecodes."),
+    ],
+)
+def test_a_bad_camera_is_named(change: dict[str, float], expected: str) -> None:
+    report = replace(make_report(), sync=make_sync(**change))
+    assert expected in texts(report)
+    assert expected.partition(": ")[2] in Page(page_text(report)).words
+
+
+def test_bad_colours_scores_files_and_stages_are_named() -> None:
+    report = make_report()
+    cameras = list(report.rig.cameras) if report.rig else []
+    cameras[2] = replace(cameras[2], gains=(1.0, 0.5, 1.0))
+    scores = tuple(
+        replace(s, psnr_db=s.psnr_db - 14 * (s.camera == "cam1") - 8 * (s.frame == 9)) for s in report.scores
+    )
+    scene = replace(make_scene(), verified=False, problem="frame 3 differs", dynamic=(4000,) * 12)
+    failed = StageRecord("encode", StageOutcome.FAILED, 2.0, reason="the disk is full")
+    bad = replace(
+        report, rig=Rig(tuple(cameras), "a ring"), scores=scores, scene=scene, stages=(*report.stages, failed)
+    )
+    assert texts(bad) == [
+        "stages: The stage 'encode' failed: the disk is full.",
+        "colour: cam2 needs a colour gain of 0.50.",
+        "quality: cam1 scores 10.8 dB, 6.5 dB below the median camera.",
+        "quality: 1 of 12 frames score 3 dB or more below the median frame, the worst being frame 9 with 9.6 dB.",
+        "quality: The mean of 17.3 dB is poor: the difference shows at a glance.",
+        "size: The scene file does not decode to what was fitted: frame 3 differs.",
+        "gaussians: 80% of the Gaussians are dynamic: noise may pass for motion.",
+    ]
+
+
+def test_scores_without_held_out_cameras_are_not_sold_as_more() -> None:
+    report = replace(make_report(), held_out=())
+    assert "No camera was held out" in texts(report)[0]
+    assert "PSNR, fitted cameras" in Page(page_text(report)).words
+
+
+# ---- pictures
+
+
+def test_pictures_are_embedded_with_their_difference() -> None:
+    rng = np.random.default_rng(0)
+    truth = cv2.GaussianBlur(rng.integers(0, 200, (90, 160, 3), dtype=np.uint8), (0, 0), 3)
+    render = truth + np.uint8(10)
+    report = ReportInput("pictures", pictures=(Comparison("cam1", 0, truth, render),))
+    urls = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page_text(report))
+    shown = [cv2.imdecode(np.frombuffer(base64.b64decode(url), np.uint8), cv2.IMREAD_COLOR)[..., ::-1] for url in urls]
+    # JPEG of smooth pictures at quality 88 is within a few grey values
+    for got, wanted in zip(shown, (truth, render, np.full_like(truth, 40)), strict=True):
+        assert np.abs(got.astype(int) - wanted).mean() < 2
+
+
+def test_pictures_may_be_files_and_large_ones_shrink(tmp_path: Path) -> None:
+    picture = np.full((720, 1280, 3), (200, 100, 50), np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), picture[..., ::-1])
+    report = ReportInput("files", pictures=(Comparison("cam1", 0, tmp_path / "a.png", picture),))
+    assert page_text(report).count('width="640" height="360"') == 3
+
+
+def test_unusable_pictures_are_refused(tmp_path: Path) -> None:
+    good, other = np.zeros((20, 30, 3), np.uint8), np.zeros((20, 31, 3), np.uint8)
+    (tmp_path / "bad.png").write_text("no picture")
+    for truth, error, message in [
+        (tmp_path / "none.png", FileNotFoundError, "which is not there"),
+        (tmp_path / "bad.png", ValueError, "cannot be read as a picture"),
+        (other, ValueError, "must have one size, but have 31x20 and 30x20"),
+        (good[..., 0], ValueError, r"must be uint8 \[H, W, 3\]"),
+    ]:
+        with pytest.raises(error, match=message):
+            page_text(ReportInput("bad", pictures=(Comparison("cam1", 0, truth, good),)))  # type: ignore[arg-type]
+
+
+def test_first_middle_and_worst_frames_get_pictures() -> None:
+    levels = [25, 24, 21, 24, 26]
+    scores = [FrameScore("b", frame, level, 0.9) for frame, level in enumerate(levels)]
+    scores += [FrameScore("a", 7, 20.0, 0.9)]
+    assert frames_to_picture(scores[::-1]) == (
+        ("a", 7, "first, middle, worst"), ("b", 0, "first"), ("b", 2, "middle, worst"),
+    )  # fmt: skip
+    assert frames_to_picture([]) == ()
+
+
+# ---- plots
+
+
+def svg_root(text: str) -> ElementTree.Element:
+    return ElementTree.fromstring(text)
+
+
+numbers = st.floats(-1e9, 1e9, allow_subnormal=False) | st.just(math.nan)
+
+
+@given(
+    st.lists(numbers, min_size=1, max_size=30),
+    st.lists(st.integers(0, 29), max_size=4),
+    st.booleans(),
+)
+def test_charts_of_any_numbers_are_sound(values: list[float], marks: list[int], from_zero: bool) -> None:
+    series = [Series("a <b>", range(len(values)), values), Series("flat", range(len(values)), [1.0] * len(values))]
+    chart = line_chart(series, title='"t"', x_label="x", y_label="y & z", marks=marks, from_zero=from_zero)
+    root = svg_root(chart)
+    assert "nan" not in chart
+    points = re.findall(r"[ML](-?[\d.]+) (-?[\d.]+)", chart)
+    assert len(points) == len(values) + sum(not math.isnan(value) for value in values)
+    assert all(-0.1 <= float(y) <= 260.1 for _, y in points)
+    assert [text.text for text in root.iter("text") if text.get("class") == "label s1"].count("flat") == 1
+
+
+@given(st.lists(st.floats(0, 1e12), max_size=40))
+@example([5e-324])
+def test_bars_stand_on_zero_and_keep_their_ratio(values: list[float]) -> None:
+    root = svg_root(bar_chart(values, title="t", x_label="x", y_label="y", strong=[0]))
+    heights = [float(bar.get("height", "nan")) for bar in root.iter("rect")]
+    assert len(heights) == len(values)
+    top = max(values, default=0)
+    if top > 1e-6:
+        assert np.allclose(np.array(heights) / max(heights), np.array(values) / top, atol=1e-3)  # two decimals of px
+
+
+def test_the_rig_is_seen_from_above_and_from_the_side() -> None:
+    rig = make_rig(8)
+    across, away, up = rig_axes(rig.cameras)
+    assert np.allclose(up, [0, 0, 1])
+    assert np.allclose(np.cross(across, away), up)
+    above, side = rig_views(rig.cameras, held_out=["cam2"], volume=Volume((0, 0, 0), 1.0), unit="m")
+    dots = [[(float(c.get("cx", 0)), float(c.get("cy", 0))) for c in svg_root(view).iter("circle") if c.get("r") == "3"]
+            for view in (above, side)]  # fmt: skip
+    ring = np.hypot(*(np.array(dots[0]) - 235).T)
+    assert np.allclose(ring, ring[0], atol=0.1)  # a circle from above, a line from the side; pixels have one decimal
+    assert np.ptp(np.array(dots[1])[:, 1]) < 0.2
+    assert above.count('class="camera held"') == 2
+    assert above.count('class="volume"') == 1
+
+
+def test_cameras_on_a_pole_have_a_view_too() -> None:
+    rig = make_rig(3)
+    poses = []
+    for index in range(3):
+        pose = rig.cameras[0].camera_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ [0, 0, index]
+        poses.append(replace(rig.cameras[index], camera_from_world=pose))
+    axes = np.stack(rig_axes(poses))
+    assert np.allclose(axes @ axes.T, np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(None, "–"), (0.421, "0.42 s"), (12.34, "12.3 s"), (59.99, "60.0 s"), (245.2, "4 min 5 s"), (7380, "2 h 3 min")],
+)
+def test_durations_read_well(seconds: float | None, words: str) -> None:
+    assert duration(seconds) == words
+
+
+# ---- scene files
+
+
+def test_figures_of_a_scene_come_from_its_header(tmp_path: Path) -> None:
+    from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
+    from packuv.gaussians.segment import Segment
+    from packuv.scene import SceneHeader, open_scene, write_scene
+
+    rng, columns = np.random.default_rng(1), attribute_count(0)
+    low, high = np.full(columns, -1.0), np.full(columns, 1.0)
+    low[6], high[6] = OPACITY_RANGE
+    quantizer = Quantizer(np.zeros(3), 1.0, np.ones(3), low, high)
+    paths = []
+    for first, length, count in ((0, 3, 40), (3, 2, 50)):
+        key = Codes(
+            rng.integers(0, 9, (count, 3), dtype=np.uint16), rng.integers(1, 9, (count, columns), dtype=np.uint8)
+        )
+        moves = np.arange(count) < 10
+        xyz = np.repeat(key.xyz[None, :10], length - 1, axis=0)
+        xyz[-1] += 1  # the second of three frames repeats the first, and takes no packet
+        attributes = np.repeat(key.attributes[None, :10], length - 1, axis=0)
+        paths.append(tmp_path / f"{first}.npz")
+        Segment(first, key, moves, xyz, attributes).save(paths[-1])
+    times = np.arange(5, dtype=np.int64) * 40_000_000
+    written = write_scene(tmp_path / "scene.mkv", paths, SceneHeader(quantizer, times, Fraction(25)))
+    with open_scene(tmp_path / "scene.mkv") as scene:
+        figures = scene_figures(scene, verified=True)
+    assert figures.gaussians == (40, 40, 40, 50, 50)
+    assert figures.dynamic == (10,) * 5
+    assert figures.bytes == written.bytes
+    assert sum(figures.frame_bytes) == sum(written.track_bytes.values())
+    assert figures.frame_bytes[1] == 0 < min(figures.frame_bytes[index] for index in (0, 2, 3, 4))
+    assert summary(ReportInput("s", scene=figures))["mb_per_30_frames"] == pytest.approx(written.bytes * 6 / 1e6)
+
+
+def test_figures_that_do_not_belong_together_are_refused() -> None:
+    with pytest.raises(ValueError, match="must have one length"):
+        SceneFigures("s", 1, Fraction(30), (1, 2), (1,), (1,))
+    with pytest.raises(ValueError, match="instants 0 to 2"):
+        MotionCurve(np.zeros(3), (0, 3))
+    with pytest.raises(ValueError, match="valid StageOutcome"):
+        StageRecord("fit", "nearly", 1.0)  # type: ignore[arg-type]

@@ -1,0 +1,74 @@
+"""Scores: what a gain may explain, what tables keep, which cameras stand for the rest."""
+
+from __future__ import annotations
+
+import doctest
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from packuv.footage.lens import gain_table
+from packuv.metrics import psnr
+from packuv.score import Score, read_table, spread, summary, with_own_gain, write_table
+from tasks.stages import evaluate
+from tasks.stages.evaluate import frame_scores
+
+RNG = np.random.default_rng(5)
+SCENE = RNG.uniform(0.05, 0.7, (3, 24, 32)).astype(np.float32)
+
+
+def test_examples_in_docstrings():
+    assert doctest.testmod(evaluate).failed == 0
+
+
+@given(st.tuples(*[st.floats(0.8, 1.25)] * 3))
+def test_own_gain_undoes_any_exposure_and_white_balance(gains):
+    levels = np.rint(SCENE * 255).astype(np.uint8)
+    filmed = np.stack([table[plane] for table, plane in zip(gain_table(gains), levels, strict=True)])
+    shown = (levels / 255).astype(np.float32)
+    # Exact but for the straight part of sRGB near black, which the factor on sRGB + 0.055 leaves out.
+    assert psnr(with_own_gain(shown, filmed), filmed) > 60
+    assert psnr(with_own_gain(filmed, filmed), filmed) > 90
+
+
+def test_own_gain_does_not_explain_structure():
+    noisy = np.clip(SCENE + RNG.normal(0, 0.1, SCENE.shape), 0, 1).astype(np.float32)
+    # A single factor fitted to independent noise gains next to nothing.
+    assert psnr(with_own_gain(noisy, SCENE), SCENE) == pytest.approx(psnr(noisy, SCENE), abs=0.5)
+
+
+FLICKER = (None, 0.01, 0.03)
+
+
+def scores() -> list[Score]:
+    return [
+        Score(frame, frame * 33_000_000, camera, True, 20.0 + frame, 0.5, level, 0.6, 22.0, 0.7, FLICKER[frame])
+        for frame in range(3)
+        for camera, level in (("cam05", 24.0), ("cam14", None))
+    ]
+
+
+def test_table_gives_scores_back(tmp_path):
+    write_table(tmp_path / "metrics.arrow", scores())
+    assert list(read_table(tmp_path / "metrics.arrow")) == scores()
+
+
+def test_exact_pictures_count_as_infinite_in_the_report_and_not_at_all_in_means():
+    assert [item.psnr_db for item in frame_scores(scores())][:2] == [24.0, float("inf")]
+    facts = summary(scores(), frames=3, size_bytes=3000, borders=[2])
+    assert facts["by_camera"]["cam05"]["psnr_rig_db"] == 24.0
+    assert facts["by_camera"]["cam14"]["psnr_rig_db"] is None
+    assert facts["mean"]["psnr_db"] == 21.0
+    assert facts["held_out"]
+    assert facts["bytes_per_frame"] == 1000
+    assert facts["seam"] == pytest.approx(3.0)
+    assert summary(scores(), frames=3, size_bytes=3000, borders=[])["seam"] is None
+
+
+@given(st.lists(st.text(min_size=1, max_size=3), unique=True, max_size=40), st.integers(1, 8))
+def test_spread_takes_distinct_names_in_order(names, count):
+    chosen = spread(names, count)
+    assert len(chosen) == min(count, len(names))
+    assert list(chosen) == [name for name in names if name in chosen]
