@@ -167,7 +167,7 @@ def fit_case(
     first = solver.run(shots, len(shots), of=iterations)
     last = solver.run(shots, iterations - len(shots), of=iterations)
     finite = all(np.isfinite(getattr(solver.model.gaussians, name)).all() for name in ATTRIBUTES)
-    return Outcome(first, last, solver.guarded, finite)
+    return Outcome(first["photometric"], last["photometric"], solver.guarded, finite)
 
 
 def absurd_starts(cameras: Sequence[PinholeCamera]) -> Iterator[tuple[str, Gaussians]]:

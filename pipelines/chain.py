@@ -3,35 +3,43 @@ borders between segments that show."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
+from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
 from packuv.motion.keyframes import fitting_order, promoted
 from pipelines.options import SequenceOptions
+from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.fitting import (
+    CutSegment,
+    FitFirst,
+    FitNext,
+    FitSegment,
+    MeasureSeam,
     count_pictures,
-    cut_segment,
-    fit_first,
-    fit_next,
-    fit_segment,
-    measure_seam,
     read_losses,
     read_seam,
 )
+from tasks.stages.footage import Take
 from tasks.stages.plan import Plan
 
 
 class Future(Protocol):
     """A stage under way."""
 
-    def result(self) -> Any:
+    def result(self) -> Key:
         """Wait for the stage; its artefact, or the exception that it raised."""
 
 
-Submit = Callable[..., Future]
+class Submit(Protocol):
+    """Starts a stage, now or when there is room."""
+
+    def __call__(self, stage: Stage, /) -> Future: ...
+
+
 Piece = tuple[Key, Future, range]
 """A keyframe, its segment and the segment's instants"""
 
@@ -44,8 +52,7 @@ class Chain:
     plan: Plan
     options: SequenceOptions
     submit: Submit
-    groups: Key
-    points: Key
+    take: Take
     background: Key | None
     motion: Key
 
@@ -57,7 +64,7 @@ class Chain:
         of the segment before it, which costs less and shows no border.
         """
         instants = [span.start for span in spans]
-        anchor, steps = fitting_order(count_pictures(self.workshop, self.plan, self.groups, instants))
+        anchor, steps = fitting_order(count_pictures(self.workshop, self.plan, self.take.groups, instants))
         keys, segments = {anchor: self._first(instants[anchor]).result()}, {}
         last = anchor
         for index, start in steps:
@@ -79,12 +86,12 @@ class Chain:
 
     def _promote(self, key: Key, segment: Future, span: range) -> Iterator[Piece]:
         """The segment, cut where the fit of a frame shows that a keyframe is missing."""
-        frame = promoted(read_losses(self.workshop, segment.result()), self.options.keyframes)
+        frame = promoted(read_losses(self.workshop.path(segment.result())), self.options.keyframes)
         if frame is None:
             yield key, segment, span
             return
         head, rest = range(span.start, span.start + frame), range(span.start + frame, span.stop)
-        cut = self.submit(cut_segment, self.workshop, segment.result(), frame)
+        cut = self.submit(CutSegment(segment=segment.result(), frames=frame))
         yield key, cut, head
         yield from self._promote(*self._continue((key, cut, head), rest))
 
@@ -93,9 +100,8 @@ class Chain:
         limit, (key, segment, span) = self.options.keyframes.seam, before
         if not limit or len(span) < 2:
             return False
-        sources = (self.workshop, self.plan, self.groups, self.points)
-        measured = self.submit(measure_seam, *sources, key, segment.result(), piece[0], self.options.pictures)
-        ratio = read_seam(self.workshop, measured.result())
+        measured = self.submit(MeasureSeam(take=self.take, key=key, segment=segment.result(), after=piece[0]))
+        ratio = read_seam(self.workshop.path(measured.result()))
         return ratio is not None and ratio > limit
 
     def _continue(self, before: Piece, span: range) -> Piece:
@@ -105,13 +111,25 @@ class Chain:
         return again, self._segment(again, span), span
 
     def _first(self, instant: int) -> Future:
-        sources, options = (self.workshop, self.plan, self.groups, self.points, self.background), self.options
-        return self.submit(fit_first, *sources, instant, options.pictures, options.motion, options.fit)
+        fit = self.options.fit.part(FirstOptions)
+        motion = self.options.motion
+        return self.submit(
+            FitFirst(take=self.take, background=self.background, instant=instant, motion=motion, options=fit)
+        )
 
     def _next(self, key: Key, step: tuple[int, int], end: Key | None = None) -> Future:
-        sources, options = (self.workshop, self.plan, self.groups, self.points, self.background), self.options
-        return self.submit(fit_next, *sources, key, end, step, options.pictures, options.motion, options.fit)
+        return self.submit(
+            FitNext(
+                take=self.take,
+                background=self.background,
+                previous=key,
+                end=end,
+                step=step,
+                motion=self.options.motion,
+                options=self.options.fit.part(NextOptions),
+            )
+        )
 
     def _segment(self, key: Key, span: range) -> Future:
-        sources, options = (self.workshop, self.plan, self.groups, self.points, self.motion), self.options
-        return self.submit(fit_segment, *sources, key, span, options.pictures, options.fit)
+        instants, fit = (span.start, span.stop), self.options.fit.part(FrameOptions)
+        return self.submit(FitSegment(take=self.take, motion=self.motion, key=key, span=instants, options=fit))

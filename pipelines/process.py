@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -18,15 +18,16 @@ from pipelines.events import Event, Journal
 from pipelines.options import compose
 from pipelines.request import RunRequest
 from pipelines.results import Run, collect, run_json
-from pipelines.stages import Made, run_stages
+from pipelines.stages import Made, Sequence
 from sync.capture import Capture, find_capture
 from tasks.artefacts.jobs import Jobs
 from tasks.artefacts.recipe import write_json
-from tasks.artefacts.store import Store
+from tasks.artefacts.stage import Stage
+from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
 from tasks.report.record import summary
 from tasks.report.write import write_report
-from tasks.stages.encode import SCENE, encode_finished
+from tasks.stages.encode import SCENE
 from tasks.stages.plan import Plan
 
 RUN, PARTIAL = "run.json", "scene.partial.mkv"
@@ -76,14 +77,18 @@ def _quality(figures: Mapping[str, Any]) -> Iterator[str]:
         yield f"size       {figures['mb_per_30_frames']:.2f} MB per 30 frames"
 
 
+Engine = Callable[[Callable[[Stage], Key]], Submit]
+"""Given who makes stages, starts them"""
+
+
 def process_directly(request: RunRequest, journal: Journal) -> Outcome:
     """Process a sequence in this process and its jobs, without the workflow engine."""
     with ThreadPoolExecutor(max_workers=jobs_at_once(request)) as pool:
-        return process(request, journal, pool.submit)
+        return process(request, journal, lambda make: lambda stage: pool.submit(make, stage))
 
 
-def process(request: RunRequest, journal: Journal, submit: Submit) -> Outcome:
-    """Process a sequence by stages that `submit` starts.
+def process(request: RunRequest, journal: Journal, engine: Engine) -> Outcome:
+    """Process a sequence by stages that the engine starts.
 
     Raises ValueError or FileNotFoundError for bad input, OSError when the disk cannot hold the results, and what a
     failing stage raises. Whatever ends the run, no job goes on after it.
@@ -96,14 +101,15 @@ def process(request: RunRequest, journal: Journal, submit: Submit) -> Outcome:
     folder = Path(request.out).absolute() / capture.name
     folder.mkdir(parents=True, exist_ok=True)
     jobs = Jobs(threads=max(1, _cores() // jobs_at_once(request)))
-    workshop = Workshop(Store(folder / "store"), jobs, journal)
-    run = Run(folder.name, request, options, plan, workshop, journal, started, Made())
+    workshop = Workshop(Store(folder / "store"), plan.capture, jobs, journal)
+    sequence = Sequence(workshop, plan, options, engine(workshop.make), Made())
+    run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
     try:
-        run_stages(workshop, plan, options, request.stop_after, submit, run.made)
+        sequence.run(request.stop_after)
         return _publish(run, folder)
     except BaseException:
         jobs.cancel()
-        _leave_finished(run, folder)
+        _leave_finished(sequence, folder)
         raise
     finally:
         write_json(folder / RUN, run_json(run))
@@ -126,12 +132,10 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _leave_finished(run: Run, folder: Path) -> None:
+def _leave_finished(sequence: Sequence, folder: Path) -> None:
     """What is fitted of a run that stops, from the first segment on without a gap, as a scene file that plays."""
-    segments = run.made.keys.get("segment", [])
-    if segments and not run.made.get("encode"):
-        sources = (run.workshop, run.plan, run.made.only("sync"), run.made.only("points"), run.made.keys["key"][0])
-        encode_finished(*sources, segments, run.options.pictures, run.options.encode, path=folder / PARTIAL)
+    if sequence.made.get("segment") and not sequence.made.get("encode"):
+        sequence.encoded().write_finished(folder / PARTIAL, sequence.workshop.site)
 
 
 def _publish(run: Run, folder: Path) -> Outcome:

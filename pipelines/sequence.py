@@ -10,13 +10,13 @@ from prefect.task_runners import ThreadPoolTaskRunner
 from pipelines.events import Journal
 from pipelines.process import Outcome, jobs_at_once, process
 from pipelines.request import RunRequest
-from tasks.engine import submit
+from tasks.engine import submitter
 
 
 @flow(name="sequence", persist_result=False, validate_parameters=False)
 def process_sequence(request: RunRequest, journal: Journal | None = None) -> Outcome:
     """From a capture folder to a scene file, with report."""
-    return process(request, journal or Journal(), submit)
+    return process(request, journal or Journal(), submitter)
 
 
 def run_flow(request: RunRequest, journal: Journal) -> Outcome:

@@ -7,21 +7,23 @@ would keep that worker from working.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pipelines.chain import Chain, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
+from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.calibrate import find_points, find_rig
-from tasks.stages.encode import encode, verify
-from tasks.stages.evaluate import evaluate
-from tasks.stages.fitting import find_background
+from tasks.stages.calibrate import FindPoints, find_rig
+from tasks.stages.encode import Encode, Verify
+from tasks.stages.evaluate import Evaluate, scored_cameras
+from tasks.stages.fitting import background_of
+from tasks.stages.footage import Take
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import synchronize
-from tasks.stages.track import choose_keyframes, find_motion, read_spans
+from tasks.stages.track import ChooseKeyframes, FindMotion, read_spans
 
 
 @dataclass
@@ -46,52 +48,94 @@ class Made:
         return self.keys[stage][0] if stage in self.keys else None
 
 
-def run_stages(
-    workshop: Workshop, plan: Plan, options: SequenceOptions, stop_after: str, submit: Submit, made: Made
-) -> None:
-    """Have every artefact of the sequence up to the stage `stop_after`, noting each in `made`.
+@dataclass(frozen=True)
+class Sequence:
+    """One sequence on its way through the stages."""
 
-    Raises what the first failing stage raises, and OSError when the disk cannot hold the results.
-    """
-    for stage in STAGES[: STAGES.index(stop_after) + 1]:
-        match stage:
-            case "sync":
-                made.add(submit(synchronize, workshop, plan, options.sync).result())
-                check_space(workshop, plan, options, made.only("sync"))
-            case "calibrate":
-                _calibrate(workshop, plan, options, submit, made)
-            case "flow":
-                _track(workshop, plan, options, submit, made)
-            case "fit":
-                _fit(workshop, plan, options, submit, made)
-            case "encode":
-                parts = (made.keys["key"][0], made.keys["segment"], options.pictures, options.encode)
-                made.add(submit(encode, workshop, plan, made.only("sync"), made.only("points"), *parts).result())
-            case "verify":
-                made.add(submit(verify, workshop, made.only("encode"), made.keys["segment"]).result())
-            case "evaluate":
-                sources = (made.only("sync"), made.only("points"), made.only("encode"))
-                made.add(submit(evaluate, workshop, plan, *sources, options.pictures, options.evaluate).result())
+    workshop: Workshop
+    plan: Plan
+    options: SequenceOptions
+    submit: Submit
+    made: Made
 
+    def run(self, stop_after: str) -> None:
+        """Have every artefact up to the stage `stop_after`, noting each in `made`.
 
-def _calibrate(workshop: Workshop, plan: Plan, options: SequenceOptions, submit: Submit, made: Made) -> None:
-    groups = made.only("sync")
-    rig = made.add(submit(find_rig, workshop, plan, groups, options.rig).result())
-    made.add(submit(find_points, workshop, plan, groups, rig, options.points).result())
+        Raises what the first failing stage raises, and OSError when the disk cannot hold the results.
+        """
+        steps = {
+            "sync": self._synchronize,
+            "calibrate": self._calibrate,
+            "flow": self._track,
+            "fit": self._fit,
+            "encode": self._encode,
+            "verify": self._verify,
+            "evaluate": self._evaluate,
+        }
+        for stage in STAGES[: STAGES.index(stop_after) + 1]:
+            if stage in steps:
+                steps[stage]()
 
+    def encoded(self) -> Encode:
+        """The scene file of the segments that are there."""
+        return Encode(
+            take=replace(self._take("points"), cameras=tuple(self.plan.videos)),
+            held_out=self.plan.held_out,
+            key=self.made.keys["key"][0],
+            segments=tuple(self.made.keys["segment"]),
+            options=self.options.encode,
+        )
 
-def _track(workshop: Workshop, plan: Plan, options: SequenceOptions, submit: Submit, made: Made) -> None:
-    groups, rig = made.only("sync"), made.only("rig")
-    motion = made.add(submit(find_motion, workshop, plan, groups, rig, options.pictures, options.motion).result())
-    made.add(submit(choose_keyframes, workshop, motion, options.keyframes).result())
+    def _make(self, stage: Stage) -> Key:
+        return self.made.add(self.submit(stage).result())
 
+    def _take(self, rig: str) -> Take:
+        """The pictures that a fit sees, with the rig of that stage."""
+        return Take(
+            groups=self.made.only("sync"),
+            rig=self.made.only(rig),
+            cameras=self.plan.fitted,
+            first=self.plan.first,
+            stop=self.plan.stop,
+            pictures=self.options.pictures,
+        )
 
-def _fit(workshop: Workshop, plan: Plan, options: SequenceOptions, submit: Submit, made: Made) -> None:
-    groups, points, motion = (made.only(stage) for stage in ("sync", "points", "motion"))
-    settings = (options.pictures, options.fit.background)
-    background = submit(find_background, workshop, plan, groups, points, *settings).result()
-    if background:
-        made.add(background)
-    spans = read_spans(workshop, made.only("keyframes"))
-    for pair in Chain(workshop, plan, options, submit, groups, points, background, motion).fit(spans):
-        made.add(*pair)
+    def _synchronize(self) -> None:
+        groups = self._make(synchronize(self.workshop, self.options.sync))
+        check_space(self.workshop, self.plan, self.options, groups)
+
+    def _calibrate(self) -> None:
+        groups, plan = self.made.only("sync"), self.plan
+        rig = self._make(find_rig(self.workshop, plan, groups, self.options.rig))
+        take = Take(groups=groups, rig=rig, cameras=tuple(plan.videos), first=plan.first)
+        self._make(FindPoints(take=take, fitted=plan.fitted, options=self.options.points))
+
+    def _track(self) -> None:
+        motion = self._make(FindMotion(take=self._take("rig"), options=self.options.motion))
+        self._make(ChooseKeyframes(motion=motion, options=self.options.keyframes))
+
+    def _fit(self) -> None:
+        take, options = self._take("points"), self.options
+        background = None
+        if options.fit.background.iteration_share:
+            background = self._make(background_of(take, options.fit.background))
+        else:
+            self.workshop.listener.skipped("background", "fit.background.iteration_share is 0")
+        told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
+        chain = Chain(self.workshop, self.plan, options, self.submit, told, background, self.made.only("motion"))
+        for pair in chain.fit(read_spans(self.workshop.path(self.made.only("keyframes")))):
+            self.made.add(*pair)
+
+    def _encode(self) -> None:
+        self._make(self.encoded())
+
+    def _verify(self) -> None:
+        self._make(Verify(scene=self.made.only("encode"), segments=tuple(self.made.keys["segment"])))
+
+    def _evaluate(self) -> None:
+        cameras = scored_cameras(self.plan, self.options.evaluate)
+        if not self.plan.held_out:
+            why = f"no camera is held out; scored on fitted {', '.join(cameras)}"
+            self.workshop.listener.skipped("unseen scores", why)
+        take = replace(self._take("points"), cameras=cameras, stop=None)
+        self._make(Evaluate(take=take, scene=self.made.only("encode")))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 from prefect import Task, task
@@ -18,6 +17,7 @@ from prefect.states import Completed
 from prefect.tasks import exponential_backoff
 
 from tasks.artefacts.jobs import JobDiedError
+from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
 
 RETRIES = 2
@@ -48,13 +48,28 @@ def worth_retrying(task: Task[..., Any], run: TaskRun, state: State[Any]) -> boo
     return False
 
 
-@cache
-def as_task(stage: Callable[..., Key]) -> Task[..., Any]:
-    """A stage as a Prefect task; an artefact that was there already shows as the state "Skipped"."""
+def submitter(make: Callable[[Stage], Key]) -> Callable[[Stage], PrefectFuture[Key]]:
+    """Starts stages as tasks of the current flow run, each made by `make`.
+
+    Always by `submit`: a direct call of a task that returns a state would hand back the state, not the key.
+    """
+    tasks: dict[type[Stage], Task[..., Any]] = {}
+
+    def submit(stage: Stage) -> PrefectFuture[Key]:
+        kind = type(stage)
+        if kind not in tasks:
+            tasks[kind] = as_task(kind, make)
+        return tasks[kind].with_options(task_run_name=stage.label).submit(stage)
+
+    return submit
+
+
+def as_task(kind: type[Stage], make: Callable[[Stage], Key]) -> Task[..., Any]:
+    """A kind of stage as a Prefect task; an artefact that was there already shows as the state "Skipped"."""
 
     @task(
-        name=stage.__name__,
-        description=stage.__doc__,
+        name=kind.__name__,
+        description=kind.__doc__,
         cache_policy=NO_CACHE,
         persist_result=False,
         retries=RETRIES,
@@ -62,16 +77,8 @@ def as_task(stage: Callable[..., Key]) -> Task[..., Any]:
         retry_jitter_factor=0.5,
         retry_condition_fn=worth_retrying,
     )
-    def made(*arguments: Any) -> Any:
-        key = stage(*arguments)
+    def made(stage: Stage) -> Any:
+        key = make(stage)
         return Completed(name="Skipped", message=f"{key} is there already", data=key) if key.reused else key
 
     return made
-
-
-def submit(stage: Callable[..., Key], *arguments: Any) -> PrefectFuture[Key]:
-    """Start a stage as a task of the current flow run.
-
-    Always by `submit`: a direct call of a task that returns a state would hand back the state, not the key.
-    """
-    return as_task(stage).submit(*arguments)

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from packuv.files import write_json, write_npz
 from packuv.fit.keyframe import DEAD_CODE, KeyState
 from packuv.fit.lift import lift_motion
 from packuv.fit.model import Model
-from packuv.fit.options import FitOptions
+from packuv.fit.options import FrameOptions
 from packuv.fit.shots import find_shots, moving_rows
 from packuv.fit.solver import Solver, tiled
 from packuv.fit.start.first import empty_gaussians
@@ -31,10 +32,10 @@ def fit_segment(
     instants: range,
     *,
     motion: MotionCache,
-    options: FitOptions,
+    options: FrameOptions,
     scratch: Path,
     progress: Progress = no_progress,
-) -> tuple[Segment, list[dict[str, float]]]:
+) -> tuple[Segment, list[dict[str, Any]]]:
     """Fit the frames of one segment; `instants` starts with the keyframe's own. Also returns figures per frame.
 
     After every frame the state goes to `scratch`, from which a later call continues with the same result.
@@ -59,8 +60,8 @@ def _fit_frame(
     instant: int,
     masks: Sequence[np.ndarray | None],
     flows: Sequence[np.ndarray | None],
-    options: FitOptions,
-) -> tuple[np.ndarray, dict[str, float]]:
+    options: FrameOptions,
+) -> tuple[np.ndarray, dict[str, Any]]:
     """Carry the model on to one instant; returns the rows that it changed, bool [N], and figures."""
     started = time.monotonic()
     rows = np.zeros(len(model), bool)
@@ -76,12 +77,17 @@ def _fit_frame(
     model.forget_moments(np.flatnonzero(rows | spare))
     solver.free(rows | spare)
     shots = tiled(find_shots(views, instant, masks), masks, solver, views)
-    loss, count = solver.settle(shots, options.frame_iterations)
+    losses, count = solver.settle(shots, options)
     changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
-    tiles = float(np.mean([shot.tiles.mean() for shot in shots if shot.tiles is not None]))
-    figures = {"instant": instant, "seconds": time.monotonic() - started, "iterations": count,
-               "dynamic": int(changed.sum()), "tiles": tiles, "guarded": solver.guarded}  # fmt: skip
-    return changed, figures if loss is None else {**figures, "loss": loss}
+    figures = {
+        "instant": instant,
+        "seconds": time.monotonic() - started,
+        "iterations": count,
+        "dynamic": int(changed.sum()),
+        "tiles": float(np.mean([shot.tiles.mean() for shot in shots if shot.tiles is not None])),
+        "guarded": solver.guarded,
+    }
+    return changed, figures if losses is None else {**figures, "loss": sum(losses.values()), "losses": dict(losses)}
 
 
 class Track:
@@ -90,14 +96,14 @@ class Track:
     def __init__(self, key: KeyState, model: Model, scratch: Path) -> None:
         self.model = model
         self.frames: list[Codes] = []
-        self.figures: list[dict[str, float]] = []
+        self.figures: list[dict[str, Any]] = []
         self._key = key
         self._scratch = scratch
         self._first = key.quantizer.encode(model.gaussians)
         self._changed = np.zeros(len(model), bool)
 
     @classmethod
-    def resume(cls, key: KeyState, options: FitOptions, scratch: Path) -> Track:
+    def resume(cls, key: KeyState, options: FrameOptions, scratch: Path) -> Track:
         """Where the last call was cut off, or at the keyframe."""
         model = Model(key.gaussians)
         model.append(empty_gaussians(options.spare, key.bounds, sh_degree=key.quantizer.sh_degree))
@@ -107,7 +113,7 @@ class Track:
             track._load(json.loads(path.read_text())["figures"])
         return track
 
-    def add(self, frame: tuple[np.ndarray, dict[str, float]]) -> None:
+    def add(self, frame: tuple[np.ndarray, dict[str, Any]]) -> None:
         """Take over the model as the next frame; `frame` tells which rows it changed, and figures."""
         rows, figures = frame
         self._changed |= rows
@@ -140,7 +146,7 @@ class Track:
                       if self.frames else np.empty((0, dynamic.sum(), width), np.uint8))  # fmt: skip
         return Segment(self._key.instant, self._first[ever], dynamic[ever], xyz, attributes)
 
-    def _load(self, figures: list[dict[str, float]]) -> None:
+    def _load(self, figures: list[dict[str, Any]]) -> None:
         count = len(figures)
         with np.load(self._scratch / f"state_{count:06d}.npz") as data:
             self.model.overwrite(np.arange(len(self.model)), Gaussians(*(data[name] for name in ATTRIBUTES)))

@@ -1,8 +1,7 @@
-"""Fit Gaussians to the pictures of many cameras: the keyframe chain and the frames of each segment (paper §4.2).
+"""Fit keyframes to the pictures of many cameras (paper §4.2); `packuv.fit.frames` fits the frames between them.
 
     fit_first     pictures of one instant -> the first keyframe, and the quantizer of the whole sequence
     fit_next      a keyframe and the pictures of another's instant -> that one; what did not change keeps its codes
-    fit_segment   a keyframe and the instants after it -> a `Segment`; frame by frame, from each to the next
 
 From the moment the quantizer is fixed every iteration renders decoded codes and the gradient passes straight through
 to float32 masters (low-precision optimisation), so the codes that are stored are the ones that were fitted.
@@ -15,15 +14,16 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from packuv.files import write_json, write_npz
 from packuv.fit.losses import photometric_loss
 from packuv.fit.model import Model
-from packuv.fit.options import FitOptions
+from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
 from packuv.fit.shots import Shot, find_shots, halved, moving_rows
-from packuv.fit.solver import Solver, tiled
+from packuv.fit.solver import Losses, Solver, tiled
 from packuv.fit.start.bounds import Bounds, find_bounds
 from packuv.fit.start.first import first_gaussians, neighbour_distance, round_gaussians
 from packuv.fit.start.hull import hull_points, in_hull
@@ -36,9 +36,6 @@ from packuv.motion.background import Still
 from packuv.motion.step import MotionOptions, difference
 from packuv.progress import Progress, Ticks, no_progress
 from packuv.raster import RasterOptions, Workspace, render
-
-VERSION = 5
-"""Raised with every change that alters what a fit returns"""
 
 DEAD_CODE = 1
 """Opacity codes up to this one decode below 1/255, which no renderer draws"""
@@ -53,8 +50,8 @@ class KeyState:
     """float32 masters, not rounded to codes"""
     quantizer: Quantizer
     bounds: Bounds
-    figures: Mapping[str, float]
-    """What the fit measured: seconds, loss, Gaussians"""
+    figures: Mapping[str, Any]
+    """What the fit measured: seconds, loss and its terms, Gaussians"""
 
     def save(self, folder: Path) -> None:
         """Write state.npz and key.json."""
@@ -79,7 +76,7 @@ def fit_first(
     points: Points | None,
     stills: Sequence[Still],
     motion: MotionOptions,
-    options: FitOptions,
+    options: FirstOptions,
     progress: Progress = no_progress,
 ) -> KeyState:
     """Fit the first keyframe from sparse points, the shell around the scene and random Gaussians: the background of
@@ -104,25 +101,31 @@ def fit_first(
     total = options.iterations
     ticks = Ticks(progress, total)
     coarse, floating = round(total * options.coarse_share), round(total * options.float_share)
-    solver.run([halved(shot) for shot in first], coarse, of=total, dense=True, ticks=ticks)
+    solver.run([halved(shot) for shot in first], coarse, of=total, grow_from=options.start.count, ticks=ticks)
     if shell is not None:
         depths = (shell.depths(camera, index, bounds.near) for index, camera in enumerate(cameras))
         first = [replace(shot, depths=known) for shot, known in zip(first, depths, strict=True)]
     if with_background:
-        solver.run(first, round(total * options.background.iteration_share) - coarse, of=total, dense=True, ticks=ticks)
+        solver.run(
+            first,
+            round(total * options.background.iteration_share) - coarse,
+            of=total,
+            grow_from=options.start.count,
+            ticks=ticks,
+        )
         masks = _before_background(views, instant, stills, motion)
         solver.append(_hull_gaussians(views, instant, masks, bounds, options, rng, options.sh_degree))
     else:
         shots = first
-    solver.run(shots, floating - solver.done, of=total, dense=True, ticks=ticks)
+    solver.run(shots, floating - solver.done, of=total, grow_from=options.start.count, ticks=ticks)
     solver.keep(solver.worth_keeping())
     model.gaussians = canonical(model.gaussians)
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
     degree = needed_degree(model.gaussians, shots, near=bounds.near, options=options)
     model.limit_sh(degree)
     solver.fix(choose_quantizer(model.gaussians, bounds, degree))
-    loss = solver.run(shots, total - floating, of=total, ticks=ticks)
-    return KeyState(instant, model.gaussians, solver.known_quantizer, bounds, _figures(started, loss, solver))
+    losses = solver.run(shots, total - floating, of=total, ticks=ticks)
+    return KeyState(instant, model.gaussians, solver.known_quantizer, bounds, _figures(started, losses, solver))
 
 
 def fit_next(
@@ -133,7 +136,7 @@ def fit_next(
     masks: Sequence[np.ndarray | None],
     stills: Sequence[Still],
     motion: MotionOptions,
-    options: FitOptions,
+    options: NextOptions,
     progress: Progress = no_progress,
 ) -> KeyState:
     """Fit a keyframe from a neighbouring one, later or earlier.
@@ -151,7 +154,7 @@ def fit_next(
     solver.fix(quantizer)
     shots = find_shots(views, instant, masks)
     if not shots:
-        return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, 0.0, solver))
+        return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, {}, solver))
     before, after = (_before_background(views, i, stills, motion) for i in (previous.instant, instant))
     gone = _inside(model.gaussians, views, before, bounds, options)
     gone &= ~_inside(model.gaussians, views, after, bounds, options)
@@ -161,10 +164,10 @@ def fit_next(
     seen = [mask if alone is None else alone for alone, mask in zip(after, masks, strict=True)]
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
-    loss = solver.run(shots, options.key_iterations, of=options.key_iterations, dense=True,
+    losses = solver.run(shots, options.key_iterations, of=options.key_iterations, grow_from=options.start.count,
                       ticks=Ticks(progress, options.key_iterations))  # fmt: skip
     solver.keep(~solver.rows | solver.worth_keeping())
-    return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, loss, solver))
+    return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, losses, solver))
 
 
 def _before_background(
@@ -183,7 +186,7 @@ def _inside(
     views: Views,
     masks: Sequence[np.ndarray | None],
     bounds: Bounds,
-    options: FitOptions,
+    options: KeyframeOptions,
 ) -> np.ndarray:
     """Gaussians in the hull of the masks, bool [N]; none if too few cameras have one."""
     seeing = [(camera, mask) for camera, mask in zip(views.cameras, masks, strict=True) if mask is not None]
@@ -193,7 +196,7 @@ def _inside(
     return in_hull(gaussians.means.astype(np.float64), cameras, known, bounds=bounds, options=options.start)
 
 
-def _surface(shell: Shell | None, points: Points | None, options: FitOptions) -> Points:
+def _surface(shell: Shell | None, points: Points | None, options: FirstOptions) -> Points:
     """Where surfaces are: sparse points, sure places of the shell, and the rest of the shell evenly."""
     start, rng = options.start, np.random.default_rng([options.seed, 3])
     room = round(start.count * start.surface_share)
@@ -205,7 +208,7 @@ def _surface(shell: Shell | None, points: Points | None, options: FitOptions) ->
     return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
 
 
-def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, options: FitOptions) -> int:
+def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, options: FirstOptions) -> int:
     """The lowest SH degree whose pictures are nearly as good as those of all bands: view dependence that a scene does
     not show is not carried. Nothing is fitted again, so a band that helps is kept rather than lost."""
     full, workspace, raster = options.sh_degree, Workspace(), RasterOptions(near, device=options.device)
@@ -249,7 +252,7 @@ def _hull_gaussians(
     instant: int,
     masks: Sequence[np.ndarray | None],
     bounds: Bounds,
-    options: FitOptions,
+    options: KeyframeOptions,
     rng: np.random.Generator,
     sh_degree: int,
 ) -> Gaussians:
@@ -264,7 +267,14 @@ def _hull_gaussians(
     return canonical(born)
 
 
-def _figures(started: float, loss: float, solver: Solver) -> dict[str, float]:
-    return {"seconds": time.monotonic() - started, "loss": loss, "gaussians": len(solver.model),
-            "changed": int(solver.rows.sum()), "iterations": solver.done, "guarded": solver.guarded,
-            "saturated": solver.known_quantizer.saturation(solver.model.gaussians)}  # fmt: skip
+def _figures(started: float, losses: Losses, solver: Solver) -> dict[str, Any]:
+    return {
+        "seconds": time.monotonic() - started,
+        "loss": sum(losses.values()),
+        "losses": dict(losses),
+        "gaussians": len(solver.model),
+        "changed": int(solver.rows.sum()),
+        "iterations": solver.done,
+        "guarded": solver.guarded,
+        "saturated": solver.known_quantizer.saturation(solver.model.gaussians),
+    }

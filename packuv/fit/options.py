@@ -1,8 +1,13 @@
-"""How long and how large a fit is."""
+"""How long and how large a fit is, by what needs it.
+
+A run is given one table, `FitOptions`. Each piece of work declares the part that it reads, so that no other setting
+can change its result, nor the name of its artefact.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import TypeVar
 
 from packuv.fit.density import DensityOptions
 from packuv.fit.labels import LabelOptions
@@ -14,37 +19,14 @@ from packuv.fit.start.shell import ShellOptions
 from packuv.gaussians.uvmap import UvOptions
 from packuv.motion.background import BackgroundOptions
 
+Part = TypeVar("Part", bound="SolverOptions")
+
 
 @dataclass(frozen=True)
-class FitOptions:
-    """How long and how large; presets live in `pipelines.options`."""
+class LossOptions:
+    """What the terms of the loss weigh, see `packuv.fit.terms`."""
 
-    iterations: int = 1500
-    """Of the first keyframe, one camera each"""
-    key_iterations: int = 500
-    """Of each later keyframe"""
-    frame_iterations: int = 240
-    """Of each frame inside a segment, at most"""
-    coarse_share: float = 0.1
-    """Share of the first keyframe's iterations on pictures of half the size"""
-    float_share: float = 0.7
-    """Share of the first keyframe's iterations before the quantizer is fixed"""
-    low_precision: bool = True
-    """Render what the codes decode to; without it everything is fitted in floats and rounded afterwards (ablation)"""
-    sh_degree: int = 0
-    """View dependence at most: 0 none, 1 to 3 as in 3D Gaussian Splatting; bands that gain nothing are dropped"""
-    sh_gain: float = 0.01
-    """Share of the loss that the bands above a degree must gain to be carried"""
-    near_share: float = 0.2
-    """Near plane, in scene radii; cameras may sit in the wall they film"""
-    near_jitter: float = 0.5
-    """Share of the iterations that draw the near plane at random up to `near_reach`: what only hides close before one
-    camera cannot explain its picture then"""
-    near_reach: float = 0.7
-    """In scene radii"""
-    random_background: bool = True
-    """Draw keyframes before a colour at random in each iteration, but where a picture is black: what it shows must then
-    be covered, and no camera can be explained by leaving a place half transparent"""
+    photometric: PhotometricOptions = field(default_factory=PhotometricOptions)
     depth_weight: float = 0.05
     """Of the mean error of depth, in scene radii, where the background's shell is sure (paper, objective)"""
     opacity_weight: float = 0.0
@@ -53,31 +35,113 @@ class FitOptions:
     """Of the squared excess of the longest standard deviation over `scale_limit`, in radii (paper, objective)"""
     scale_limit: float = 0.1
     """In scene radii"""
+
+
+@dataclass(frozen=True)
+class SolverOptions(LossOptions):
+    """How one iteration goes, whatever is fitted."""
+
+    low_precision: bool = True
+    """Render what the codes decode to; without it everything is fitted in floats and rounded afterwards (ablation)"""
+    near_jitter: float = 0.5
+    """Share of the iterations that draw the near plane at random up to `near_reach`: what only hides close before one
+    camera cannot explain its picture then"""
+    near_reach: float = 0.7
+    """In scene radii"""
+    random_background: bool = True
+    """Draw keyframes before a colour at random in each iteration, but where a picture is black: what it shows must then
+    be covered, and no camera can be explained by leaving a place half transparent"""
+    seed: int = 0
+    device: str = "cpu"
+    """Who renders and labels: "cpu", or "cuda" (see `packuv.fit.device`); the rest is done by the CPU either way"""
+    density: DensityOptions = field(default_factory=DensityOptions)
+    rates: Rates = field(default_factory=Rates)
+    uv: UvOptions = field(default_factory=UvOptions)
+
+
+@dataclass(frozen=True)
+class KeyframeOptions(SolverOptions):
+    """What all keyframes read."""
+
+    key_births: int = 10_000
+    """Gaussians born inside the hull of what changed since the last keyframe"""
+    start: StartOptions = field(default_factory=StartOptions)
+
+
+@dataclass(frozen=True)
+class FirstOptions(KeyframeOptions):
+    """What the first keyframe reads."""
+
+    iterations: int = 1500
+    """Of the first keyframe, one camera each"""
+    coarse_share: float = 0.1
+    """Share of the first keyframe's iterations on pictures of half the size"""
+    float_share: float = 0.7
+    """Share of the first keyframe's iterations before the quantizer is fixed"""
+    sh_degree: int = 0
+    """View dependence at most: 0 none, 1 to 3 as in 3D Gaussian Splatting; bands that gain nothing are dropped"""
+    sh_gain: float = 0.01
+    """Share of the loss that the bands above a degree must gain to be carried"""
+    near_share: float = 0.2
+    """Near plane, in scene radii; cameras may sit in the wall they film"""
+    background: BackgroundOptions = field(default_factory=BackgroundOptions)
+    shell: ShellOptions = field(default_factory=ShellOptions)
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"the first keyframe needs an iteration at least, but iterations is {self.iterations}")
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"the SH degree must be 0 to 3, but is {self.sh_degree}")
+
+
+@dataclass(frozen=True)
+class ChangeOptions(SolverOptions):
+    """What a fit of a part of the Gaussians reads."""
+
+    labels: LabelOptions = field(default_factory=LabelOptions)
+
+
+@dataclass(frozen=True)
+class NextOptions(KeyframeOptions, ChangeOptions):
+    """What a keyframe after the first reads."""
+
+    key_iterations: int = 500
+    """Of each later keyframe"""
+
+    def __post_init__(self) -> None:
+        if self.key_iterations < 1:
+            raise ValueError(f"a keyframe needs an iteration at least, but key_iterations is {self.key_iterations}")
+
+
+@dataclass(frozen=True)
+class FrameOptions(ChangeOptions):
+    """What the frames of a segment read."""
+
+    frame_iterations: int = 240
+    """Of each frame inside a segment, at most"""
     frame_rate_scale: float = 4.0
     """Factor on the means' rate inside segments: the lifted motion is only nearly right"""
     spare: int = 1500
     """Rows per segment that are empty at its keyframe, for what comes into view"""
-    key_births: int = 10_000
-    """Gaussians born inside the hull of what changed since the last keyframe"""
     births_share: float = 0.05
     """Of the moving rows, how many empty ones may come alive in one pass"""
     settle: float = 0.02
     """A frame stops when its last two rounds lowered the loss by less than this share, on average"""
-    seed: int = 0
-    device: str = "cpu"
-    """Who renders and labels: "cpu", or "cuda" (see `packuv.fit.device`); the rest is done by the CPU either way"""
-    background: BackgroundOptions = field(default_factory=BackgroundOptions)
-    shell: ShellOptions = field(default_factory=ShellOptions)
-    start: StartOptions = field(default_factory=StartOptions)
-    density: DensityOptions = field(default_factory=DensityOptions)
-    rates: Rates = field(default_factory=Rates)
-    photometric: PhotometricOptions = field(default_factory=PhotometricOptions)
-    uv: UvOptions = field(default_factory=UvOptions)
-    labels: LabelOptions = field(default_factory=LabelOptions)
     lift: LiftOptions = field(default_factory=LiftOptions)
 
     def __post_init__(self) -> None:
-        if min(self.iterations, self.key_iterations, self.frame_iterations) < 1:
-            raise ValueError("a fit needs at least one iteration per keyframe and frame")
-        if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"the SH degree must be 0 to 3, but is {self.sh_degree}")
+        if self.frame_iterations < 1:
+            raise ValueError(f"a frame needs an iteration at least, but frame_iterations is {self.frame_iterations}")
+
+
+@dataclass(frozen=True)
+class FitOptions(FirstOptions, NextOptions, FrameOptions):
+    """All settings of a fit; presets live in `pipelines.options`."""
+
+    def __post_init__(self) -> None:
+        for part in (FirstOptions, NextOptions, FrameOptions):
+            self.part(part)  # which checks itself
+
+    def part(self, kind: type[Part]) -> Part:
+        """What one piece of work reads, and no more."""
+        return kind(**{item.name: getattr(self, item.name) for item in fields(kind)})

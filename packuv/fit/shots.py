@@ -11,40 +11,11 @@ import numpy as np
 from packuv.camera import PinholeCamera
 from packuv.fit.depth import SparseDepth
 from packuv.fit.labels import dynamic_labels
-from packuv.fit.options import FitOptions
+from packuv.fit.options import ChangeOptions
 from packuv.fit.start.bounds import Bounds
 from packuv.footage.views import Views
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import Gaussians
-
-
-def find_shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | None = None) -> list[Shot]:
-    """Pictures of the cameras that have one, and whose mask, if given, is not empty."""
-    shots = []
-    for index, camera in enumerate(views.cameras):
-        if masks is not None and (mask := masks[index]) is not None and not mask.any():
-            continue
-        target = views.picture(index, instant)
-        if target is not None:
-            shots.append(Shot(camera, target))
-    if masks is None and len(shots) < 2:
-        raise ValueError(f"instant {instant} has pictures of {len(shots)} cameras to fit, but needs two or more; "
-                         "choose another range with --frames")  # fmt: skip
-    return shots
-
-
-def moving_rows(
-    gaussians: Gaussians,
-    quantizer: Quantizer,
-    views: Views,
-    masks: Sequence[np.ndarray | None],
-    bounds: Bounds,
-    options: FitOptions,
-) -> np.ndarray:  # bool [N]
-    """Gaussians that a motion mask touches in some camera (paper, algorithm 4)."""
-    drawn = quantizer.decode(quantizer.encode(gaussians))
-    return dynamic_labels(drawn, views.cameras, masks, near=bounds.near, options=options.labels,
-                          device=options.device)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -71,3 +42,32 @@ def halved(shot: Shot) -> Shot:
     if shot.known is not None:
         known = cv2.resize(shot.known.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     return Shot(camera, np.ascontiguousarray(small.transpose(2, 0, 1)), known=known)
+
+
+def find_shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | None = None) -> list[Shot]:
+    """Pictures of the cameras that have one, and whose mask, if given, is not empty."""
+    shots = []
+    for index, camera in enumerate(views.cameras):
+        if masks is not None and (mask := masks[index]) is not None and not mask.any():
+            continue
+        target = views.picture(index, instant)
+        if target is not None:
+            shots.append(Shot(camera, target))
+    if masks is None and len(shots) < 2:
+        raise ValueError(f"instant {instant} has pictures of {len(shots)} cameras to fit, but needs two or more; "
+                         "choose another range with --frames")  # fmt: skip
+    return shots
+
+
+def moving_rows(
+    gaussians: Gaussians,
+    quantizer: Quantizer,
+    views: Views,
+    masks: Sequence[np.ndarray | None],
+    bounds: Bounds,
+    options: ChangeOptions,
+) -> np.ndarray:  # bool [N]
+    """Gaussians that a motion mask touches in some camera (paper, algorithm 4)."""
+    drawn = quantizer.decode(quantizer.encode(gaussians))
+    return dynamic_labels(drawn, views.cameras, masks, near=bounds.near, options=options.labels,
+                          device=options.device)  # fmt: skip

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from packuv.fit.density import ScreenGradient, grow, prune, relocate
-from packuv.fit.depth import depth_loss
 from packuv.fit.guard import Guard
 from packuv.fit.labels import active_tiles
-from packuv.fit.losses import photometric_loss
 from packuv.fit.model import Model
-from packuv.fit.options import FitOptions
+from packuv.fit.options import FrameOptions, SolverOptions
 from packuv.fit.shots import Shot
 from packuv.fit.start.bounds import Bounds
+from packuv.fit.terms import Pull, Seen, pulls, summed
 from packuv.footage.views import Views
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity, rows_of
 from packuv.progress import Ticks
-from packuv.raster import RasterOptions, Rendering, Workspace, gradients, render
+from packuv.raster import Gradients, RasterOptions, Rendering, Workspace, gradients, render
 
 _VOID = 16 / 255
 """A pixel whose channels are all below may show nothing: decoded black is not quite black"""
@@ -32,10 +31,20 @@ _GREY = 1 / 255
 """A loss below one grey level is as good as none: what it gains does not count in full"""
 
 
+Losses = Mapping[str, float]
+"""Values of the terms by name; the loss is their sum"""
+
+
+def mean_losses(losses: Sequence[Losses]) -> Losses:
+    """Mean of each term over the iterations in which it applied."""
+    names = dict.fromkeys(name for part in losses for name in part)
+    return {name: float(np.mean([part[name] for part in losses if name in part])) for name in names}
+
+
 class Solver:
     """Iterations over the pictures of one instant."""
 
-    def __init__(self, model: Model, bounds: Bounds, options: FitOptions, rng: np.random.Generator) -> None:
+    def __init__(self, model: Model, bounds: Bounds, options: SolverOptions, rng: np.random.Generator) -> None:
         self.model = model
         self.rows = np.ones(len(model), bool)
         """Which Gaussians may change"""
@@ -97,48 +106,60 @@ class Solver:
         self._start_afresh()
 
     def run(
-        self, shots: Sequence[Shot], count: int, *, of: int, dense: bool = False, ticks: Ticks | None = None
-    ) -> float:
-        """`count` iterations of `of`, if `dense` with growth and pruning; returns the mean loss of the last pass."""
-        losses = []
+        self, shots: Sequence[Shot], count: int, *, of: int, grow_from: int | None = None, ticks: Ticks | None = None
+    ) -> Losses:
+        """`count` iterations of `of`; returns the mean losses of the last pass.
+
+        With `grow_from` Gaussians in the beginning, their number grows towards the cap; without it stays.
+        """
+        losses: list[Losses] = []
         self._order = []
+        density = self._options.density
         for _ in range(count):
             shot, opaque = shots[self._next(shots)], self._options.random_background
             losses.append(self._iterate(shot, self._near(), progress=self.done / of, opaque=opaque))
-            if dense and self.done % self._options.density.every == 0 and self.done < of * self._options.density.until:
-                self._change_density(of)
+            if grow_from is not None and self.done % density.every == 0 and self.done < of * density.until:
+                self._change_density(of, grow_from)
             if ticks:
                 ticks.advance()
-        return float(np.mean(losses[-len(shots) :])) if losses else 0.0
+        return mean_losses(losses[-len(shots) :])
 
-    def settle(self, shots: Sequence[Shot], limit: int) -> tuple[float | None, int]:
-        """Rounds over the cameras until they gain little or `limit` iterations; returns the mean loss and the count.
+    def settle(self, shots: Sequence[Shot], options: FrameOptions) -> tuple[Losses | None, int]:
+        """Rounds over the cameras until they gain little; returns the mean losses and the iterations that it took.
 
-        A gain compares each picture with itself, in iterations that draw everything; the loss is None if none did.
+        A gain compares each picture with itself, in iterations that draw everything; the losses are None if none did.
         Empty rows are used for what the pictures lack after each of the first rounds.
         """
-        losses, gains, done = np.full(len(shots), np.nan), list[float](), 0
-        while done < limit and not (gains and np.mean(gains[-2:]) < self._options.settle):
+        limit, done = options.frame_iterations, 0
+        losses, gains = dict[int, Losses](), list[float]()
+        while done < limit and not (gains and np.mean(gains[-2:]) < options.settle):
             count = min(max(len(shots), _ROUND), limit - done)
-            fresh, done = self._round(shots, count), done + count
-            both = np.isfinite(losses) & np.isfinite(fresh)
-            if both.any():
-                gains.append((losses - fresh)[both].mean() / max(losses[both].mean(), _GREY))
-            losses = np.where(np.isfinite(fresh), fresh, losses)
-            if done <= limit * self._options.density.until:
-                relocate(self.model, self.gradient.mean, self.rows, bounds=self.bounds,
-                         options=self._options.density, share=self._options.births_share, rng=self._rng)  # fmt: skip
+            fresh, done = self._round(shots, count, options.frame_rate_scale), done + count
+            if both := sorted(losses.keys() & fresh.keys()):
+                before, now = (np.array([sum(part[shot].values()) for shot in both]) for part in (losses, fresh))
+                gains.append((before - now).mean() / max(before.mean(), _GREY))
+            losses |= fresh
+            if done <= limit * options.density.until:
+                relocate(
+                    self.model,
+                    self.gradient.mean,
+                    self.rows,
+                    bounds=self.bounds,
+                    options=options.density,
+                    share=options.births_share,
+                    rng=self._rng,
+                )
                 self._start_afresh()
-        return (float(np.nanmean(losses)) if np.isfinite(losses).any() else None), done
+        return (mean_losses([losses[shot] for shot in sorted(losses)]) if losses else None), done
 
-    def _round(self, shots: Sequence[Shot], count: int) -> np.ndarray:
-        """`count` iterations of a frame; the last loss of each shot that was drawn whole, NaN for others, [shots]."""
-        losses = np.full(len(shots), np.nan)
+    def _round(self, shots: Sequence[Shot], count: int, rate_scale: float) -> dict[int, Losses]:
+        """`count` iterations of a frame; the last losses of each shot that was drawn whole, by its index."""
+        losses: dict[int, Losses] = {}
         for _ in range(count):
             index, near = self._next(shots), self._near()
-            loss = self._iterate(shots[index], near, progress=0.0, scale=self._options.frame_rate_scale)
+            found = self._iterate(shots[index], near, progress=0.0, scale=rate_scale)
             if near == self.bounds.near:
-                losses[index] = loss
+                losses[index] = found
         return losses
 
     def _next(self, shots: Sequence[Shot]) -> int:
@@ -147,43 +168,42 @@ class Solver:
             self._order = list(self._rng.permutation(len(shots)))
         return self._order.pop()
 
-    def _iterate(self, shot: Shot, near: float, *, progress: float, scale: float = 1.0, opaque: bool = False) -> float:
-        options, drawn = self._options, self._decoded()
-        rendering = render(drawn, shot.camera, options=RasterOptions(near, device=options.device),
-                           tiles=shot.tiles, workspace=self._workspace)  # fmt: skip
+    def _iterate(self, shot: Shot, near: float, *, progress: float, scale: float = 1.0, opaque: bool = False) -> Losses:
+        options = self._options
+        raster = RasterOptions(near, device=options.device)
+        rendering = render(self._decoded(), shot.camera, options=raster, tiles=shot.tiles, workspace=self._workspace)
+        moving = self.rows & (rendering.visible > 0)
         behind = self._behind(shot.target) if opaque else None
         picture = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
         # What is not known is taken for right as it is.
         target = shot.target if shot.known is None else np.where(shot.known, shot.target, picture)
-        loss = photometric_loss(picture, target, options=options.photometric, tiles=shot.tiles)
-        if not np.isfinite(loss.value):
-            raise ValueError(f"the loss of camera {shot.camera.name!r} is {loss.value} in iteration {self.done}: its "
-                             "picture or the Gaussians hold values that are not finite")  # fmt: skip
-        d_depth, d_alpha = self._depth_gradients(rendering, shot)
-        if behind is not None:
-            d_alpha = d_alpha - (loss.gradient * behind).sum(axis=0)
-        found = gradients(rendering, loss.gradient, d_depth, d_alpha, rows=self.rows)
-        self.gradient.add(found.means2d, rendering.visible, shot.camera.width, shot.camera.height)
-        moving = self.rows & (rendering.visible > 0)
-        values = {name: getattr(found, name) for name in ATTRIBUTES}
-        self._regularise(values, moving)
+        found = pulls(Seen(rendering, picture, target, shot, self.model.gaussians, moving, self.bounds.radius), options)
+        drawn = self._carried_back(rendering, found, behind)
+        self.gradient.add(drawn.means2d, rendering.visible, shot.camera.width, shot.camera.height)
+        values = {name: getattr(drawn, name) for name in ATTRIBUTES}
+        for pull in found.values():
+            for name, gradient in pull.gaussians.items():
+                values[name] = values[name] + gradient
         self.model.step(values, options.rates, radius=self.bounds.radius * scale, progress=progress, rows=moving)
         self._guard.check(self.model, values, moving, f"camera {shot.camera.name!r}, iteration {self.done}")
-        self._overflown += found.overflow_count
+        self._overflown += drawn.overflow_count
         self.done += 1
-        return loss.value
+        return {name: pull.value for name, pull in found.items()}
+
+    def _carried_back(self, rendering: Rendering, found: Mapping[str, Pull], behind: np.ndarray | None) -> Gradients:
+        """Derivatives by the Gaussians of what pulls at the rendering, before the colour `behind` it."""
+        d_colour = summed(pull.colour for pull in found.values())
+        d_depth, d_alpha = (summed(getattr(pull, name) for pull in found.values()) for name in ("depth", "alpha"))
+        d_colour = np.zeros_like(rendering.colour) if d_colour is None else d_colour
+        if behind is not None:
+            through = (d_colour * behind).sum(axis=0)
+            d_alpha = (np.zeros_like(rendering.alpha) if d_alpha is None else d_alpha) - through
+        return gradients(rendering, d_colour, d_depth, d_alpha, rows=self.rows)
 
     def _behind(self, target: np.ndarray) -> np.ndarray:
         """A colour at random behind all Gaussians, black where the target is, float32 [3, H, W]."""
         colour = self._rng.random(3).astype(np.float32)
         return colour[:, None, None] * (target.max(axis=0) > _VOID)
-
-    def _depth_gradients(self, rendering: Rendering, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
-        weight = np.float32(self._options.depth_weight)
-        if shot.depths is None or not weight:
-            return np.zeros_like(rendering.depth), np.zeros_like(rendering.alpha)
-        _, d_depth, d_alpha = depth_loss(rendering.depth, rendering.alpha, shot.depths, scale=self.bounds.radius)
-        return weight * d_depth, weight * d_alpha
 
     def _decoded(self) -> Gaussians:
         """What the renderer draws; only rows that may change are decoded again."""
@@ -204,33 +224,18 @@ class Solver:
             return float(self._rng.uniform(near, max(near, options.near_reach * self.bounds.radius)))
         return near
 
-    def _regularise(self, values: dict[str, np.ndarray], rows: np.ndarray) -> None:
-        """Add the gradients of the opacity and scale terms, means over the rows that may change."""
-        options, g, count = self._options, self.model.gaussians, max(1, int(rows.sum()))
-        if options.opacity_weight:
-            alpha = opacity(g)
-            slope = alpha * (1 - alpha) * (1 - 2 * alpha) * (options.opacity_weight / count)
-            values["opacity_logits"] = values["opacity_logits"] + (slope * rows).astype(np.float32)
-        if options.scale_weight:
-            axis = g.log_scales.argmax(axis=1)[:, None]
-            longest = np.exp(np.take_along_axis(g.log_scales, axis, 1)) / self.bounds.radius
-            excess = np.maximum(longest - options.scale_limit, 0) * rows[:, None]
-            pull = np.zeros_like(g.log_scales)
-            np.put_along_axis(pull, axis, (2 * options.scale_weight / count * excess * longest).astype(np.float32), 1)
-            values["log_scales"] = values["log_scales"] + pull
-
     def worth_keeping(self) -> np.ndarray:
         """Rows that pruning leaves, bool [N]."""
         return prune(self.model, self.gradient, bounds=self.bounds, options=self._options.density, uv=self._options.uv)
 
-    def _change_density(self, of: int) -> None:
+    def _change_density(self, of: int, grow_from: int) -> None:
         """Prune, then grow towards the cap."""
         options = self._options.density
         kept = ~self.rows | self.worth_keeping()
         score = np.where(self.rows & kept & (self.gradient.seen > 0), self.gradient.mean, 0)[kept]
         self.keep(kept)
         share = min(1.0, self.done / (of * options.until))
-        target = round(self._options.start.count + (options.cap - self._options.start.count) * share)
+        target = round(grow_from + (options.cap - grow_from) * share)
         count = max(0, min(target, options.cap) - len(self.model))
         before = len(self.model)
         grow(self.model, score, count, bounds=self.bounds, options=options, rng=self._rng)

@@ -14,6 +14,7 @@ from functools import cache
 from typing import Any
 
 import llvmlite.binding
+import numba
 import numpy as np
 from llvmlite import ir
 from numba import extending, types
@@ -28,6 +29,7 @@ WIDTH = 16
 
 intrinsic: Any = extending.intrinsic
 # Numba's own type would count the typing context among the arguments.
+_numba: Any = numba.config  # its settings are made when it is imported
 
 _I1, _I8, _I32, _I64, _F32 = ir.IntType(1), ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType()
 
@@ -39,7 +41,19 @@ def register_lanes() -> Lanes:
     Sixteen lanes of AVX2 are two of the sixteen registers that there are, so running sums spill to memory; folded to
     one register each they cost half as many loads and stores.
     """
-    return ALL if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else HALF
+    return ALL if "+avx512f" in _cpu_features() else HALF
+
+
+def cpu_description() -> str:
+    """Processor and width of its vectors that kernels are compiled for: where two agree, so do results, to the bit."""
+    name = _numba.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+    return f"{name}, {len(register_lanes())} lanes"
+
+
+def _cpu_features() -> list[str]:
+    """Signed names of what kernels may use, as Numba takes them: NUMBA_CPU_FEATURES, or all that the machine has."""
+    given: str | None = _numba.CPU_FEATURES
+    return (llvmlite.binding.get_host_cpu_features().flatten() if given is None else given).split(",")
 
 
 class FloatVector(types.Type):

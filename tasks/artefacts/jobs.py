@@ -1,30 +1,29 @@
 """Heavy work in processes of their own.
 
-A job is a function named by "module:function", called with plain arguments in a fresh interpreter. It dies with the
-thread that started it, also by kill -9; it can be ended from outside at any moment; its memory is its own; and what
-it prints goes to a log file. Run as `python -m tasks.artefacts.jobs SPEC.json`.
+A job is something that can be pickled and called, in a fresh interpreter. It dies with the thread that started it, also
+by kill -9; it can be ended from outside at any moment; its memory is its own; and what it prints goes to a log file.
+Run as `python -m tasks.artefacts.jobs SPEC.json`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import importlib
-import inspect
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 from packuv.progress import Progress, no_progress
-from tasks.artefacts.recipe import plain, restore
+from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import peak_memory_bytes
 
 THREAD_VARIABLES = (
@@ -37,6 +36,7 @@ THREAD_VARIABLES = (
 RAISED_AS = (FileNotFoundError, NotADirectoryError, PermissionError, OSError, ValueError, MemoryError)
 """Kinds of exception that keep their kind on the way out of a job, the particular before the general"""
 PR_SET_PDEATHSIG = 1
+JOB = "job.pickle"
 MARK = "PACKUV_JOB"
 """Environment variable of a job and all that it starts: the folder it works for"""
 
@@ -62,8 +62,10 @@ class Done:
     """What a job left."""
 
     value: Any
-    """What the function returned, as plain values"""
+    """What it returned, as plain values"""
     peak_memory_bytes: int
+    cpu: str
+    """Processor and instructions, see `packuv.kernels.simd.cpu_description`"""
 
 
 class Jobs:
@@ -78,41 +80,34 @@ class Jobs:
 
     def run(
         self,
-        function: str,
-        arguments: Mapping[str, Any],
+        job: Callable[[Progress], Any],
         *,
         folder: Path,
         progress: Progress = no_progress,
         keep_open: Sequence[int] = (),
     ) -> Done:
-        """Call `function` ("module:name") in a process of its own and wait for it.
+        """Call the job in a process of its own, with whom to tell, and wait for it.
 
-        Arguments are restored from plain values by the function's annotations; it gets `progress` beside them.
-        `folder` receives spec.json and job.log. The job inherits the descriptors in `keep_open`.
+        The job is pickled, so what it refers to must be importable by name. It returns plain values. `folder` receives
+        spec.json, job.pickle and job.log. The process inherits the descriptors in `keep_open`.
 
-        Raises what the function raised if that is ValueError, OSError or MemoryError (a subclass counts as these),
-        JobError for any other exception, JobDiedError if the process ended without a word, CancelledError after
-        `cancel`.
+        Raises what the job raised if that is ValueError, OSError or MemoryError (a subclass counts as these), JobError
+        for any other exception, JobDiedError if the process ended without a word, CancelledError after `cancel`.
         """
         end_leftovers(folder)
         spec = folder / "spec.json"
+        (folder / JOB).write_bytes(pickle.dumps(job))
         reader, writer = os.pipe()
         with open(reader, "rb") as messages:
             try:
-                text = {
-                    "function": function,
-                    "arguments": _with_text_paths(arguments),
-                    "parent": os.getpid(),
-                    "pipe": writer,
-                }
-                spec.write_text(json.dumps(text, indent=1))
+                spec.write_text(json.dumps({"job": repr(job), "parent": os.getpid(), "pipe": writer}, indent=1))
                 process = self._start(spec, folder / "job.log", [writer, *keep_open])
             finally:
                 os.close(writer)
             with self._watched(process):
                 last = _follow(messages, progress)
                 process.wait()
-        return self._outcome(last, process.returncode, function, folder / "job.log")
+        return self._outcome(last, process.returncode, job, folder / "job.log")
 
     def cancel(self) -> None:
         """End all jobs and let no new one start."""
@@ -157,29 +152,15 @@ class Jobs:
                     _kill(process)
             process.wait()
 
-    def _outcome(self, last: Mapping[str, Any] | None, code: int, function: str, log: Path) -> Done:
+    def _outcome(self, last: Mapping[str, Any] | None, code: int, job: Callable[..., Any], log: Path) -> Done:
         self.check()
         if last is None:
             raise JobDiedError(
-                f"the job {function} ended without a result ({_described(code)}); its output is in {log}", log
+                f"the job {job} ended without a result ({_described(code)}); its output is in {log}", log
             )
         if "error" in last:
             raise _exception(last["error"], log)
-        return Done(last["result"], last["peak_memory_bytes"])
-
-
-def _with_text_paths(value: Any) -> Any:
-    """Plain values for a job on this machine, for which, unlike for a recipe, a path is a value."""
-    match value:
-        case Path():
-            return str(value.absolute())
-        case Mapping():
-            return {name: _with_text_paths(item) for name, item in value.items()}
-        case list() | tuple():
-            return [_with_text_paths(item) for item in value]
-    if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _with_text_paths(getattr(value, field.name)) for field in fields(value)}
-    return plain(value)
+        return Done(last["result"], last["peak_memory_bytes"], last["cpu"])
 
 
 def _follow(messages: Any, progress: Progress) -> dict[str, Any] | None:
@@ -236,7 +217,7 @@ def main(argv: Sequence[str]) -> int:
     die_with_parent(spec["parent"])
     os.set_inheritable(spec["pipe"], False)
     with open(spec["pipe"], "w", buffering=1) as pipe:
-        pipe.write(json.dumps(_result(spec, _reporter(pipe))) + "\n")
+        pipe.write(json.dumps(_result(Path(argv[0]).with_name(JOB), _reporter(pipe))) + "\n")
     return 0
 
 
@@ -261,10 +242,18 @@ def _reporter(pipe: Any) -> Progress:
     return progress
 
 
-def _result(spec: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
+def _result(job: Path, progress: Progress) -> dict[str, Any]:
+    from packuv.kernels.simd import (
+        cpu_description,  # here, since it loads the compiler, which those who start jobs lack
+    )
+
     try:
-        value = _call(spec["function"], spec["arguments"], progress)
-        return {"result": plain(value, where="result"), "peak_memory_bytes": peak_memory_bytes()}
+        value = pickle.loads(job.read_bytes())(progress)
+        return {
+            "result": plain(value, where="result"),
+            "peak_memory_bytes": peak_memory_bytes(),
+            "cpu": cpu_description(),
+        }
     except Exception as error:
         traceback.print_exc()
         kinds = [kind.__name__ for kind in type(error).__mro__]
@@ -274,17 +263,6 @@ def _result(spec: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
 def _message(error: Exception) -> str:
     """What was said; KeyError would show it in quotes."""
     return str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
-
-
-def _call(name: str, arguments: Mapping[str, Any], progress: Progress) -> Any:
-    module, _, function_name = name.partition(":")
-    function = getattr(importlib.import_module(module), function_name)
-    hints, parameters = get_type_hints(function), inspect.signature(function).parameters
-    offered = {"out", "scratch"} - parameters.keys()
-    given = {key: restore(hints[key], value, where=key) for key, value in arguments.items() if key not in offered}
-    if "progress" in parameters:
-        given["progress"] = progress
-    return function(**given)
 
 
 if __name__ == "__main__":

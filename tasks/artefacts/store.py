@@ -16,7 +16,7 @@ import shutil
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -47,7 +47,7 @@ class Key:
 
 
 @dataclass(frozen=True)
-class Workspace:
+class Building:
     """Where one artefact is built."""
 
     out: Path
@@ -74,6 +74,8 @@ class Receipt:
     """UTC, ISO 8601"""
     notes: Mapping[str, Any]
     """What the stage said about its work"""
+    cpu: str = ""
+    """Processor and the instructions that kernels were compiled for; results agree to the bit where these are equal"""
 
     @property
     def size_bytes(self) -> int:
@@ -93,8 +95,8 @@ class Damage:
         return f"{self.key}: {self.path} {self.reason}"
 
 
-Build = Callable[[Workspace], Mapping[str, Any] | None]
-"""Fills `workspace.out`; returns notes for the receipt, of which `peak_memory_bytes` has a place of its own"""
+Build = Callable[[Building], Mapping[str, Any] | None]
+"""Fills `building.out`; returns notes for the receipt, where `peak_memory_bytes` and `cpu` have places of their own"""
 
 
 class Store:
@@ -174,7 +176,7 @@ class Store:
         """Compare every file of every artefact with its receipt; cost: reading them all."""
         return [damage for key in self.keys() for damage in self._audit(key)]
 
-    def workspace(self, key: Key) -> Path:
+    def work_folder(self, key: Key) -> Path:
         """Folder where this artefact is built; it holds the log of a failed attempt."""
         return self.root / WORK / f"{key.stage}-{key.digest}"
 
@@ -192,19 +194,22 @@ class Store:
             yield file.fileno()
 
     def _build(self, key: Key, what: Mapping[str, Any], build: Build, lock: int) -> None:
-        place = self.workspace(key)
+        place = self.work_folder(key)
         out, built = place / "out", place / BUILT
         if not built.exists():  # else killed after the work, while its files were read for the receipt
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir(parents=True)
             (place / "scratch").mkdir(exist_ok=True)
             start = time.monotonic()
-            notes = dict(build(Workspace(out, place / "scratch", lock)) or {})
-            peak = int(notes.pop("peak_memory_bytes", 0) or peak_memory_bytes())
+            notes = dict(build(Building(out, place / "scratch", lock)) or {})
+            facts = {
+                "seconds": round(time.monotonic() - start, 3),
+                "peak_memory_bytes": int(notes.pop("peak_memory_bytes", 0) or peak_memory_bytes()),
+                "cpu": notes.pop("cpu", ""),
+                "notes": notes,
+            }
             _flush_all(out)
-            write_json(
-                built, {"seconds": round(time.monotonic() - start, 3), "peak_memory_bytes": peak, "notes": notes}
-            )
+            write_json(built, facts)
         receipt = Receipt(
             recipe=what,
             outputs=_outputs(out),
@@ -229,7 +234,7 @@ class Store:
 
     def _forget(self, key: Key) -> None:
         """Remove what is left of the building; the lock file stays, since others may wait on it."""
-        shutil.rmtree(self.workspace(key), ignore_errors=True)
+        shutil.rmtree(self.work_folder(key), ignore_errors=True)
 
     def _audit(self, key: Key) -> Iterator[Damage]:
         folder, receipt = self._folder(key), self.receipt(key)
@@ -256,19 +261,21 @@ def _recipe(stage: str, version: int, options: Any, inputs: Mapping[str, Any]) -
         "stage": stage,
         "version": version,
         "options": recipe.plain(options, where="options"),
-        "inputs": recipe.plain(_named(inputs), where="inputs"),
+        "inputs": recipe.plain(named(inputs), where="inputs"),
     }
 
 
-def _named(value: Any) -> Any:
+def named(value: Any) -> Any:
     """Keys as their names, at any depth."""
     match value:
         case Key():
             return str(value)
         case Mapping():
-            return {name: _named(item) for name, item in value.items()}
+            return {name: named(item) for name, item in value.items()}
         case list() | tuple():
-            return [_named(item) for item in value]
+            return [named(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: named(getattr(value, field.name)) for field in fields(value)}
     return value
 
 

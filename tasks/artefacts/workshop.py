@@ -1,4 +1,4 @@
-"""What every stage is given: a store to put artefacts in, jobs to do the work, somebody to tell about it."""
+"""What the stages of one sequence are made with: a store for artefacts, jobs to do the work, somebody to tell."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import Any, Protocol
 
 from tasks.artefacts.digests import FileDigests
 from tasks.artefacts.jobs import Jobs
-from tasks.artefacts.store import Key, Store, Workspace
+from tasks.artefacts.stage import Files, Notes, Site, Stage, StageJob
+from tasks.artefacts.store import Building, Key, Store
 
 
 class Listener(Protocol):
@@ -19,7 +20,7 @@ class Listener(Protocol):
 
     def started(self, label: str) -> None: ...
 
-    def moved(self, label: str, done: float, total: float, note: str) -> None: ...
+    def moved(self, label: str, done: float, total: float, note: str = "") -> None: ...
 
     def waiting(self, label: str) -> None:
         """Another process builds the same artefact."""
@@ -34,46 +35,44 @@ class Listener(Protocol):
 
 @dataclass(frozen=True)
 class Workshop:
-    """Where the stages of one sequence run."""
+    """Where the stages of one sequence are made."""
 
     store: Store
+    capture: Path
+    """Capture folder"""
     jobs: Jobs
     listener: Listener
 
-    def digests(self, files: Mapping[str, Path], label: str) -> dict[str, str]:
-        """Content digests of raw files by name, remembered beside the store.
+    @property
+    def site(self) -> Site:
+        """What jobs are told of it."""
+        return Site(self.store.root, self.capture, self.jobs.threads)
+
+    def files(self, paths: Mapping[str, Path], label: str) -> Files:
+        """Raw files by name, with their digests, which are remembered beside the store.
 
         Raises FileNotFoundError that names a missing file.
         """
         remembered = FileDigests(self.store.root.parent / "file_digests.json")
-        return remembered(files, progress=partial(self.listener.moved, label))
+        return Files(remembered(paths, progress=partial(self.listener.moved, label)))
 
-    def make(
-        self,
-        stage: str,
-        version: int,
-        options: Any,
-        inputs: Mapping[str, Any],
-        function: str,
-        arguments: Mapping[str, Any],
-        *,
-        label: str = "",
-    ) -> Key:
-        """The artefact of this recipe, by the job `function` if it is not there.
+    def make(self, stage: Stage) -> Key:
+        """The artefact of a stage, by its job if it is not there.
 
-        The job gets `arguments`, and where its signature asks for them `out`, `scratch` and `progress`. What it returns
-        becomes the notes of the receipt. Raises what `Jobs.run` raises.
+        What the job returns becomes the notes of the receipt. Raises what `Jobs.run` raises.
         """
-        label = label or stage
         start = time.monotonic()
-        self.listener.started(label)
-        build = partial(self._build, function=function, arguments=arguments, label=label)
+        self.listener.started(stage.label)
+        build = partial(self._build, stage)
+        waiting = partial(self._wait, stage.label)
         try:
-            key = self.store.make(stage, version, options, inputs, build, waiting=partial(self._wait, label))
+            key = self.store.make(stage.name, stage.version, stage.settings, stage.sources, build, waiting=waiting)
         except BaseException as error:
-            self.listener.failed(label, error)
+            self.listener.failed(stage.label, error)
             raise
-        self.listener.finished(label, key, time.monotonic() - start)
+        self.listener.finished(stage.label, key, time.monotonic() - start)
+        for what, why in stage.spared(self.path(key), self.store.receipt(key).notes):
+            self.listener.skipped(what, why)
         return key
 
     def path(self, key: Key) -> Path:
@@ -84,14 +83,12 @@ class Workshop:
         self.jobs.check()
         self.listener.waiting(label)
 
-    def _build(
-        self, workspace: Workspace, *, function: str, arguments: Mapping[str, Any], label: str
-    ) -> Mapping[str, Any]:
+    def _build(self, stage: Stage, building: Building) -> dict[str, Any]:
         done = self.jobs.run(
-            function,
-            {**arguments, "out": workspace.out, "scratch": workspace.scratch},
-            folder=workspace.out.parent,
-            progress=partial(self.listener.moved, label),
-            keep_open=[workspace.lock],
+            StageJob(stage, self.site, building.out, building.scratch),
+            folder=building.out.parent,
+            progress=partial(self.listener.moved, stage.label),
+            keep_open=[building.lock],
         )
-        return {**(done.value or {}), "peak_memory_bytes": done.peak_memory_bytes}
+        notes: Notes = done.value or {}
+        return {**notes, "peak_memory_bytes": done.peak_memory_bytes, "cpu": done.cpu}

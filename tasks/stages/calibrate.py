@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,18 +18,15 @@ from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
 from packuv.files import write_json
-from packuv.footage.reader import FrameReader
-from packuv.progress import Progress
 from sync.align import FrameGroups
 from sync.capture import Capture, find_capture
+from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.footage import RIG, Footage
+from tasks.stages.footage import RIG, Footage, Take
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import read_videos
 
-RIG_VERSION = 1
-POINTS_VERSION = 1
 CHECK, MATCHES, POINTS, COLOUR = "check.json", "matches.json", "points.npz", "colour.json"
 
 
@@ -63,98 +60,120 @@ class PointOptions:
     """Instants after the first whose points tell colours too: cameras that start late have none in the first"""
 
 
-def find_rig(workshop: Workshop, plan: Plan, groups: Key, options: RigOptions) -> Key:
-    """Import and judge the calibration of the capture, or solve it: rig.json, check.json, matches.json."""
-    capture = find_capture(plan.capture)
-    cameras = tuple(plan.videos)
-    footage = Footage(plan.capture, workshop.path(groups), Path(), cameras, 0, None)
-    arguments: dict[str, Any] = {"footage": footage, "first": plan.first, "options": options}
-    reads: dict[str, Any] = {"rig": options, "cameras": cameras, "first": plan.first}
-    inputs: dict[str, Any] = {"groups": groups}
-    if capture.calibration is None:
-        return workshop.make("rig", RIG_VERSION, reads, inputs, "tasks.stages.calibrate:build_solution", arguments)
-    source = capture.calibration
-    workshop.listener.skipped("COLMAP", f"{_place(capture)} holds {_kind(source)}")
-    inputs["calibration"] = workshop.digests(_files(source), "reading calibration")
-    arguments["calibration"] = source
-    return workshop.make("rig", RIG_VERSION, reads, inputs, "tasks.stages.calibrate:build_import", arguments)
+@dataclass(frozen=True, kw_only=True)
+class ImportRig(Stage):
+    """Import the calibration of the capture and judge it by the pictures: rig.json, check.json, matches.json."""
+
+    name, version = "rig", 2
+    take: Take
+    """All cameras, as filmed"""
+    first: int
+    """Instant by which the calibration is judged"""
+    files: Files
+    options: RigOptions
+
+    def build(self, work: Work) -> Notes:
+        capture, footage = find_capture(work.site.capture), Footage(self.take, work.site)
+        source = capture.calibration
+        if source is None:
+            raise FileNotFoundError(f"the calibration of {capture.folder} has gone since the run began")
+        videos = read_videos(work.path(self.take.groups)).items()
+        rig = load_rig(source, self.take.cameras).resized({name: (v["width"], v["height"]) for name, v in videos})
+        work.progress(0, 1, "comparing the calibration with the pictures")
+        judgement = judge(rig, footage.filmed(self.first), options=self.options.judge)
+        if judgement.matches.verdict is Verdict.REJECTED and not self.options.trust:
+            raise ValueError(
+                f"{source} does not agree with the pictures: {judgement.matches.reason}; correct it, write "
+                'calibration = "solve" into capture.toml to have it solved, or use it as it is with '
+                "--set rig.trust=true"
+            )
+        _save_rig(judgement.rig, self.options, judgement.to_json(), work.out)
+        given = f"{_place(capture)} holds {_kind(source)}"
+        verdict = judgement.matches.reason
+        return {"source": "import", "given": given, "reading": judgement.reading.value, "verdict": verdict}
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        yield "COLMAP", notes["given"]
 
 
-def find_points(workshop: Workshop, plan: Plan, groups: Key, rig: Key, options: PointOptions) -> Key:
+@dataclass(frozen=True, kw_only=True)
+class SolveRig(Stage):
+    """Solve the rig, from one instant, and from several if that fails: rig.json, check.json, matches.json."""
+
+    name, version = "rig", 2
+    take: Take
+    """All cameras, as filmed"""
+    first: int
+    """Instant from which on to solve"""
+    options: RigOptions
+
+    def build(self, work: Work) -> Notes:
+        footage, options = Footage(self.take, work.site), self.options
+        instants = complete_instants(footage.load_groups(), self.take.cameras, self.first)
+        work.progress(0, 1, "COLMAP")
+        try:
+            rig = solve_rig(footage.filmed(instants[0]), options.solve, work.scratch)
+        except ValueError:
+            if options.more_instants == 1 or len(instants) == 1:
+                raise
+            chosen = instants[np.linspace(0, len(instants) - 1, options.more_instants).round().astype(int)]
+            work.progress(0, 1, f"COLMAP, {len(set(chosen.tolist()))} instants")
+            shots = [footage.filmed(instant) for instant in sorted(set(chosen.tolist()))]
+            pictures = {name: [shot[name] for shot in shots] for name in self.take.cameras}
+            rig = solve_rig(pictures, options.solve, work.scratch)
+        _save_rig(rig.select(self.take.cameras), options, {"source": rig.source}, work.out)
+        return {"source": "COLMAP", "verdict": rig.source}
+
+
+def find_rig(workshop: Workshop, plan: Plan, groups: Key, options: RigOptions) -> ImportRig | SolveRig:
+    """The stage for a capture with a calibration, or for one without."""
+    take = Take(groups=groups, cameras=tuple(plan.videos))
+    source = find_capture(plan.capture).calibration
+    if source is None:
+        return SolveRig(take=take, first=plan.first, options=options)
+    files = workshop.files(_files(source), "reading calibration")
+    return ImportRig(take=take, first=plan.first, files=files, options=options)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FindPoints(Stage):
     """Triangulate points and balance the colours: points.npz of the first instant, rig.json with gains, colour.json.
 
     Only fitted cameras take part; the others keep a gain of 1.
     """
-    footage = Footage(plan.capture, workshop.path(groups), workshop.path(rig), tuple(plan.videos), plan.first, None)
-    arguments = {"footage": footage, "fitted": plan.fitted, "options": options}
-    reads = {"points": options, "cameras": list(plan.videos), "fitted": plan.fitted, "first": plan.first}
-    inputs = {"groups": groups, "rig": rig}
-    key = workshop.make("points", POINTS_VERSION, reads, inputs, "tasks.stages.calibrate:build_points", arguments)
-    notes = workshop.store.receipt(key).notes
-    if not notes["points"]:
-        workshop.listener.skipped("sparse points", f"{notes['reason']}; the fit starts at random places")
-    elif not notes["balanced"]:
-        workshop.listener.skipped("colour balance", notes["reason"])
-    return key
 
+    name, version = "points", 2
+    take: Take
+    """All cameras, as filmed"""
+    fitted: tuple[str, ...]
+    options: PointOptions
 
-def build_import(
-    footage: Footage, calibration: Path, first: int, options: RigOptions, out: Path, progress: Progress
-) -> dict[str, Any]:
-    """The job behind `find_rig` where a calibration is given."""
-    sizes = {name: (video["width"], video["height"]) for name, video in read_videos(footage.groups).items()}
-    rig = load_rig(calibration, footage.cameras).resized(sizes)
-    progress(0, 1, "comparing the calibration with the pictures")
-    judgement = judge(rig, filmed(footage, first), options=options.judge)
-    if judgement.matches.verdict is Verdict.REJECTED and not options.trust:
-        raise ValueError(
-            f"{calibration} does not agree with the pictures: {judgement.matches.reason}; correct it, write "
-            'calibration = "solve" into capture.toml to have it solved, or use it as it is with --set rig.trust=true'
+    def build(self, work: Work) -> Notes:
+        footage, options = Footage(self.take, work.site), self.options
+        rig = footage.load_rig()
+        count = len(footage.load_groups().times_ns)
+        chosen = [0, *(instant for instant in options.more_instants if 0 < instant < count)]
+        shown = (
+            {name: picture for name, picture in footage.filmed(instant).items() if name in self.fitted}
+            for instant in chosen
         )
-    _save_rig(judgement.rig, options, judgement.to_json(), out)
-    return {"source": "import", "reading": judgement.reading.value, "verdict": judgement.matches.reason}
+        work.progress(0, 1, "matching features")
+        try:
+            points = triangulate(rig.select(self.fitted), shown, options=options.triangulate)
+        except ValueError as problem:  # the rig was judged before: it is the scene that shows too little
+            rig.save(work.out / RIG)
+            return {"points": 0, "balanced": False, "reason": str(problem)}
+        report = balance(points, options=options.balance)
+        points.save(work.out / POINTS)
+        with_gains(rig, report).save(work.out / RIG)
+        write_json(work.out / COLOUR, without_nan(report.to_json()))
+        return {"points": len(points.xyz), "balanced": report.kept, "reason": report.reason, **_figures(points)}
 
-
-def build_solution(
-    footage: Footage, first: int, options: RigOptions, out: Path, scratch: Path, progress: Progress
-) -> dict[str, Any]:
-    """The job behind `find_rig` where the rig must be solved: from one instant, and from several if that fails."""
-    instants = complete_instants(footage.load_groups(), footage.cameras, first)
-    progress(0, 1, "COLMAP")
-    try:
-        rig = solve_rig(filmed(footage, instants[0]), options.solve, scratch)
-    except ValueError:
-        if options.more_instants == 1 or len(instants) == 1:
-            raise
-        chosen = instants[np.linspace(0, len(instants) - 1, options.more_instants).round().astype(int)]
-        progress(0, 1, f"COLMAP, {len(set(chosen.tolist()))} instants")
-        shots = [filmed(footage, instant) for instant in sorted(set(chosen.tolist()))]
-        pictures = {name: [shot[name] for shot in shots] for name in footage.cameras}
-        rig = solve_rig(pictures, options.solve, scratch)
-    _save_rig(rig.select(footage.cameras), options, {"source": rig.source}, out)
-    return {"source": "COLMAP", "verdict": rig.source}
-
-
-def build_points(
-    footage: Footage, fitted: tuple[str, ...], options: PointOptions, out: Path, progress: Progress
-) -> dict[str, Any]:
-    """The job behind `find_points`."""
-    rig = footage.load_rig()
-    count = len(footage.load_groups().times_ns)
-    chosen = [0, *(instant for instant in options.more_instants if 0 < instant < count)]
-    shown = ({name: picture for name, picture in filmed(footage, instant).items() if name in fitted}
-             for instant in chosen)  # fmt: skip
-    progress(0, 1, "matching features")
-    try:
-        points = triangulate(rig.select(fitted), shown, options=options.triangulate)
-    except ValueError as problem:  # the rig was judged before: it is the scene that shows too little
-        rig.save(out / RIG)
-        return {"points": 0, "balanced": False, "reason": str(problem)}
-    report = balance(points, options=options.balance)
-    points.save(out / POINTS)
-    with_gains(rig, report).save(out / RIG)
-    write_json(out / COLOUR, without_nan(report.to_json()))
-    return {"points": len(points.xyz), "balanced": report.kept, "reason": report.reason, **_figures(points)}
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        if not notes["points"]:
+            yield "sparse points", f"{notes['reason']}; the fit starts at random places"
+        elif not notes["balanced"]:
+            yield "colour balance", notes["reason"]
 
 
 def complete_instants(groups: FrameGroups, cameras: tuple[str, ...], first: int) -> np.ndarray:
@@ -179,14 +198,6 @@ def _save_rig(rig: Rig, options: RigOptions, evidence: Mapping[str, Any], out: P
 
 def _figures(points: SparsePoints) -> dict[str, float]:
     return {"error_px": float(np.median(points.error_px)), "views": float(points.views.mean())}
-
-
-def filmed(footage: Footage, instant: int) -> dict[str, np.ndarray]:
-    """Pictures as filmed, uint8 [H, W, 3] RGB, of the cameras that have one at this instant of the footage."""
-    groups, videos = footage.load_groups(), find_capture(footage.capture).videos
-    reader = FrameReader({name: videos[name] for name in footage.cameras})
-    numbers = {name: int(groups.frames[instant, groups.cameras.index(name)]) for name in footage.cameras}
-    return {name: reader.read(name, number) for name, number in numbers.items() if number >= 0}
 
 
 def without_nan(value: Any) -> Any:

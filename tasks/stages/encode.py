@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,133 +14,93 @@ from packuv.fit.keyframe import KeyState
 from packuv.footage.lens import undistorted_camera
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.segment import Segment
-from packuv.progress import Progress
 from packuv.scene import EncodeOptions, SceneHeader, open_scene, write_scene
 from packuv.scene.sharing import stored_segments
 from packuv.scene.stream import Tolerance
 from sync.align import SyncReport
+from tasks.artefacts.stage import Notes, Site, Stage, Work
 from tasks.artefacts.store import Key
-from tasks.artefacts.workshop import Workshop
 from tasks.stages.fitting import SEGMENT
-from tasks.stages.footage import Footage, PictureOptions, footage_of, lens_camera
-from tasks.stages.plan import Plan
+from tasks.stages.footage import Footage, Take, lens_camera
 
-ENCODE_VERSION = 2
-VERIFY_VERSION = 2
 SCENE = "scene.mkv"
 
 
-def encode(
-    workshop: Workshop,
-    plan: Plan,
-    groups: Key,
-    points: Key,
-    first_key: Key,
-    segments: Sequence[Key],
-    pictures: PictureOptions,
-    options: EncodeOptions | None = None,
-) -> Key:
+@dataclass(frozen=True, kw_only=True)
+class Encode(Stage):
     """Write the scene file from the segments, in order; by default lossless."""
-    options = options or EncodeOptions()
-    arguments = {
-        "footage": footage_of(workshop, plan, groups, points, cameras=tuple(plan.videos), pictures=pictures),
-        "held_out": plan.held_out,
-        "key": workshop.path(first_key),
-        "segments": [workshop.path(key) / SEGMENT for key in segments],
-        "options": options,
-    }
-    reads = {
-        "cameras": list(plan.videos),
-        "held_out": plan.held_out,
-        "first": plan.first,
-        "stop": plan.stop,
-        "pictures": pictures,
-        "encode": options,
-    }
-    inputs = {"groups": groups, "points": points, "key": first_key, "segments": list(segments)}
-    return workshop.make("encode", ENCODE_VERSION, reads, inputs, "tasks.stages.encode:build_scene", arguments)
+
+    name, version = "encode", 3
+    take: Take
+    """All cameras"""
+    held_out: tuple[str, ...]
+    key: Key
+    """First keyframe, whose quantizer is that of all"""
+    segments: tuple[Key, ...]
+    options: EncodeOptions
+
+    def build(self, work: Work) -> Notes:
+        header = scene_header(Footage(self.take, work.site), self.held_out, KeyState.load(work.path(self.key)))
+        segments = [work.path(key) / SEGMENT for key in self.segments]
+        path = work.out / SCENE
+        summary = write_scene(path, segments, header, options=self.options, progress=work.progress)
+        notes = {"frames": summary.frames, "bytes": summary.bytes, "track_bytes": dict(summary.track_bytes)}
+        write_json(work.out / "encode.json", notes)
+        return notes
+
+    def write_finished(self, path: Path, site: Site) -> int:
+        """Write the segments as a scene file that ends after them; returns its number of frames.
+
+        For a run that stops early, or to watch one that goes on: the segments are those that are fitted, without a gap
+        from the first on. The file is whole or absent at any time, and takes the place of one that is there. Nothing
+        goes to the store, for the stage makes the same file of all segments.
+        """
+        header = scene_header(Footage(self.take, site), self.held_out, KeyState.load(site.path(self.key)))
+        segments = [site.path(key) / SEGMENT for key in self.segments]
+        frames = sum(len(Segment.load(part)) for part in segments)
+        return write_scene(path, segments, header.first(frames), options=self.options).frames
 
 
-def encode_finished(
-    workshop: Workshop,
-    plan: Plan,
-    groups: Key,
-    points: Key,
-    first_key: Key,
-    segments: Sequence[Key],
-    pictures: PictureOptions,
-    options: EncodeOptions | None = None,
-    *,
-    path: Path,
-) -> int:
-    """Write the first segments of a sequence as a scene file that ends after them; returns its number of frames.
-
-    For a run that stops early, or to watch one that goes on: `segments` are those that are fitted, without a gap from
-    the first on. The file is whole or absent at any time, and takes the place of one that is there. Nothing goes to
-    the store, for `encode` makes the same file of all segments.
-    """
-    footage = footage_of(workshop, plan, groups, points, cameras=tuple(plan.videos), pictures=pictures)
-    paths = [workshop.path(key) / SEGMENT for key in segments]
-    return write_finished(path, footage, plan.held_out, workshop.path(first_key), paths, options)
-
-
-def write_finished(
-    path: Path,
-    footage: Footage,
-    held_out: tuple[str, ...],
-    key: Path,
-    segments: Sequence[Path],
-    options: EncodeOptions | None = None,
-) -> int:
-    """Write the first segments of a sequence, by their files; see `encode_finished`."""
-    header = scene_header(footage, held_out, KeyState.load(key))
-    frames = sum(len(Segment.load(part)) for part in segments)
-    return write_scene(path, segments, header.first(frames), options=options).frames
-
-
-def verify(workshop: Workshop, scene: Key, segments: Sequence[Key]) -> Key:
+@dataclass(frozen=True, kw_only=True)
+class Verify(Stage):
     """Decode the scene file and compare every frame with the fitted segments.
 
-    Raises RuntimeError on a difference beyond the tolerance that the scene states.
+    Fails on a difference beyond the tolerance that the scene states.
     """
-    arguments = {
-        "scene": workshop.path(scene) / SCENE,
-        "segments": [workshop.path(key) / SEGMENT for key in segments],
-    }
-    inputs = {"scene": scene, "segments": list(segments)}
-    return workshop.make("verify", VERIFY_VERSION, {}, inputs, "tasks.stages.encode:build_verification", arguments)
 
+    name, version = "verify", 3
+    scene: Key
+    segments: tuple[Key, ...]
 
-def build_scene(
-    footage: Footage,
-    held_out: tuple[str, ...],
-    key: Path,
-    segments: list[Path],
-    options: EncodeOptions,
-    out: Path,
-    progress: Progress,
-) -> dict[str, Any]:
-    """The job behind `encode`."""
-    header = scene_header(footage, held_out, KeyState.load(key))
-    summary = write_scene(
-        out / SCENE,
-        segments,
-        header,
-        options=options,
-        progress=progress,
-    )
-    notes = {"frames": summary.frames, "bytes": summary.bytes, "track_bytes": dict(summary.track_bytes)}
-    write_json(out / "encode.json", notes)
-    return notes
+    def build(self, work: Work) -> Notes:
+        scene, segments = work.path(self.scene) / SCENE, [work.path(key) / SEGMENT for key in self.segments]
+        frame, worst = 0, Tolerance()
+        with open_scene(scene) as opened:
+            fitted = (Segment.load(path) for path in segments)
+            references = [entry.reference for entry in opened.index.segments]
+            if len(references) != len(segments):
+                raise RuntimeError(f"{scene} has {len(references)} segments, but {len(segments)} were fitted")
+            for path, stored in zip(segments, stored_segments(fitted, references=references), strict=True):
+                for index in range(len(stored)):
+                    allowed = opened.index.tolerance if index else Tolerance()
+                    worst = _worse(worst, opened.codes(frame), stored.frame(index), allowed, f"frame {frame} ({path})")
+                    frame += 1
+                    work.progress(frame, len(opened))
+            if frame != len(opened):
+                raise RuntimeError(f"{scene} has {len(opened)} frames, but {frame} were fitted")
+        notes = {"frames": frame, "exact": worst.exact, "largest_error": vars(worst)}
+        write_json(work.out / "verify.json", notes)
+        return notes
 
 
 def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState) -> SceneHeader:
     """What the scene says about its capture. No path and no clock time goes in: same input, same bytes."""
-    rig, report = footage.load_rig(), SyncReport.load(footage.groups)
+    groups = footage.site.path(footage.take.groups)
+    rig, report = footage.load_rig(), SyncReport.load(groups)
     return SceneHeader(
         quantizer=key.quantizer,
         times_ns=np.ascontiguousarray(footage.load_groups().times_ns),
-        rate=_rate(footage.groups),
+        rate=_rate(groups),
         cameras=tuple(undistorted_camera(lens_camera(camera)) for camera in rig.cameras),
         held_out=held_out,
         sync={
@@ -156,31 +115,10 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState) -> 
             "near": key.bounds.near,
             "scene_radius": key.bounds.radius,
             "metric": rig.metric,
-            "max_width": footage.max_width,
+            "max_width": footage.take.pictures.max_width,
             "lenses": [lens_camera(camera).to_json() for camera in rig.cameras],
         },
     )
-
-
-def build_verification(scene: Path, segments: list[Path], out: Path, progress: Progress) -> dict[str, Any]:
-    """The job behind `verify`."""
-    frame, worst = 0, Tolerance()
-    with open_scene(scene) as opened:
-        fitted = (Segment.load(path) for path in segments)
-        references = [entry.reference for entry in opened.index.segments]
-        if len(references) != len(segments):
-            raise RuntimeError(f"{scene} has {len(references)} segments, but {len(segments)} were fitted")
-        for path, stored in zip(segments, stored_segments(fitted, references=references), strict=True):
-            for index in range(len(stored)):
-                allowed = opened.index.tolerance if index else Tolerance()
-                worst = _worse(worst, opened.codes(frame), stored.frame(index), allowed, f"frame {frame} ({path})")
-                frame += 1
-                progress(frame, len(opened), "")
-        if frame != len(opened):
-            raise RuntimeError(f"{scene} has {len(opened)} frames, but {frame} were fitted")
-    notes = {"frames": frame, "exact": worst.exact, "largest_error": vars(worst)}
-    write_json(out / "verify.json", notes)
-    return notes
 
 
 def _worse(worst: Tolerance, found: Codes, fitted: Codes, allowed: Tolerance, what: str) -> Tolerance:

@@ -20,14 +20,13 @@ from sync.align import AlignOptions, FrameGroups, align
 from sync.capture import find_capture, load_timecodes
 from sync.clock import ClockMode
 from sync.probe import probe_video
+from tasks.artefacts.stage import Notes, Stage, Work
 from tasks.artefacts.store import Key
-from tasks.artefacts.workshop import Workshop
 from tasks.report.facts import FrameScore, frames_to_picture
 from tasks.stages.encode import SCENE
-from tasks.stages.footage import Footage, PictureOptions, footage_of
+from tasks.stages.footage import Footage, Take
 from tasks.stages.plan import Plan
 
-VERSION = 2
 METRICS, TABLE, PICTURES = "metrics.json", "metrics.arrow", "pictures"
 
 
@@ -43,39 +42,29 @@ class EvaluateOptions:
             raise ValueError(f"evaluation needs at least one camera, but fitted_cameras is {self.fitted_cameras}")
 
 
-def evaluate(
-    workshop: Workshop,
-    plan: Plan,
-    groups: Key,
-    points: Key,
-    scene: Key,
-    pictures: PictureOptions,
-    options: EvaluateOptions,
-) -> Key:
-    """Score every frame of the scene file on the held-out cameras: metrics.json, metrics.arrow, pictures/."""
-    cameras = plan.held_out or spread(plan.fitted, options.fitted_cameras)
-    if not plan.held_out:
-        workshop.listener.skipped("unseen scores", f"no camera is held out; scored on fitted {', '.join(cameras)}")
-    arguments = {
-        "footage": footage_of(workshop, plan, groups, points, cameras=cameras, pictures=pictures),
-        "scene": workshop.path(scene) / SCENE,
-        "options": options,
-    }
-    reads = {"evaluate": options, "pictures": pictures, "cameras": cameras, "first": plan.first}
-    inputs = {"groups": groups, "points": points, "scene": scene}
-    return workshop.make("evaluate", VERSION, reads, inputs, "tasks.stages.evaluate:build", arguments)
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Stage):
+    """Score every frame of the scene file on the cameras of a take: metrics.json, metrics.arrow, pictures/."""
+
+    name, version = "evaluate", 3
+    take: Take
+    scene: Key
+
+    def build(self, work: Work) -> Notes:
+        views, scene = Footage(self.take, work.site).open_views(), work.path(self.scene) / SCENE
+        with open_scene(scene) as opened:
+            scores = score(opened, views, work.progress)
+            write_table(work.out / TABLE, scores)
+            write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
+            borders = segment_starts(opened)
+            facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=borders)
+        write_json(work.out / METRICS, facts)
+        return {name: facts[name] for name in ("cameras", "held_out", "mean")}
 
 
-def build(footage: Footage, scene: Path, options: EvaluateOptions, out: Path, progress: Progress) -> dict[str, Any]:
-    """The job behind `evaluate`."""
-    views = footage.open_views()
-    with open_scene(scene) as opened:
-        scores = score(opened, views, progress)
-        write_table(out / TABLE, scores)
-        write_pictures(out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
-        facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
-    write_json(out / METRICS, facts)
-    return {name: facts[name] for name in ("cameras", "held_out", "mean")}
+def scored_cameras(plan: Plan, options: EvaluateOptions) -> tuple[str, ...]:
+    """Those that are held out; where none is, some of the fitted ones."""
+    return plan.held_out or spread(plan.fitted, options.fitted_cameras)
 
 
 def evaluate_scene(

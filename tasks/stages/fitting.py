@@ -5,40 +5,193 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calibration.triangulate import SparsePoints
 from packuv.files import write_json
-from packuv.fit import frames, keyframe
-from packuv.fit.keyframe import KeyState
-from packuv.fit.options import FitOptions
+from packuv.fit.frames import fit_segment
+from packuv.fit.keyframe import KeyState, fit_first, fit_next
+from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
 from packuv.fit.seam import seam, tail
 from packuv.fit.start.points import Points
 from packuv.footage.views import Views
 from packuv.gaussians.rows import hold_absent
 from packuv.gaussians.segment import Segment
-from packuv.motion.background import BackgroundOptions, Still, load_stills, save_stills
-from packuv.motion.background import find_background as measure_background
+from packuv.motion.background import BackgroundOptions, Still, find_background, load_stills, save_stills
 from packuv.motion.cache import MotionCache
 from packuv.motion.step import MotionOptions, changed_between
-from packuv.progress import Progress
 from sync.align import FrameGroups
+from tasks.artefacts.stage import Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import POINTS
-from tasks.stages.footage import Footage, PictureOptions, footage_of
+from tasks.stages.footage import Footage, Take
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import selected
 from tasks.stages.track import MOTION
 
-VERSION = 1
 SEGMENT, FIGURES, STILLS, SEAM = "segment.npz", "fit.json", "stills.npz", "seam.json"
 SURE_VIEWS = 3
 """Cameras that must see a point for Gaussians to start there; two may agree by chance"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FindBackground(Stage):
+    """Find what stands still in each fitted camera: stills.npz."""
+
+    name, version = "background", 2
+    take: Take
+    options: BackgroundOptions
+
+    def build(self, work: Work) -> Notes:
+        stills = find_background(Footage(self.take, work.site).open_views(), self.options, work.progress)
+        save_stills(work.out / STILLS, stills)
+        return {"cameras": len(stills), "known_share": float(np.mean([still.known.mean() for still in stills] or [0]))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitFirst(Stage):
+    """Fit the keyframe that the chain starts with: state.npz and key.json, with the quantizer of all."""
+
+    name, version = "key", 6
+    take: Take
+    background: Key | None
+    instant: int
+    motion: MotionOptions
+    options: FirstOptions
+
+    @property
+    def label(self) -> str:
+        return f"fit key {self.instant}"
+
+    def build(self, work: Work) -> Notes:
+        assert self.take.rig is not None, "points lie beside the rig"
+        points = work.path(self.take.rig) / POINTS
+        state = fit_first(
+            Footage(self.take, work.site).open_views(),
+            self.instant,
+            points=_sure_points(SparsePoints.load(points)) if points.exists() else None,
+            stills=_stills(work, self.background),
+            motion=self.motion,
+            options=self.options,
+            progress=work.progress,
+        )
+        state.save(work.out)
+        return dict(state.figures)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitNext(Stage):
+    """Fit a keyframe from another one, or from the last frame of that one's segment: state.npz and key.json."""
+
+    name, version = "key", 6
+    take: Take
+    background: Key | None
+    previous: Key
+    end: Key | None
+    """Segment of `previous` from whose last frame to go on"""
+    step: tuple[int, int]
+    """Instants: from, to"""
+    motion: MotionOptions
+    options: NextOptions
+
+    @property
+    def label(self) -> str:
+        return f"fit key {self.step[1]}{f' after {self.step[0]}' if self.end else ''}"
+
+    def build(self, work: Work) -> Notes:
+        views, before = Footage(self.take, work.site).open_views(), KeyState.load(work.path(self.previous))
+        if self.end:
+            before = tail(before, Segment.load(work.path(self.end) / SEGMENT))
+        instant = self.step[1]
+        state = fit_next(
+            before,
+            views,
+            instant,
+            masks=_changes(views, before.instant, instant, self.motion),
+            stills=_stills(work, self.background),
+            motion=self.motion,
+            options=self.options,
+            progress=work.progress,
+        )
+        state.save(work.out)
+        return dict(state.figures)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitSegment(Stage):
+    """Fit the instants of a segment, which starts with its keyframe: segment.npz and fit.json."""
+
+    name, version = "segment", 6
+    take: Take
+    motion: Key
+    key: Key
+    span: tuple[int, int]
+    """Instants, half-open"""
+    options: FrameOptions
+
+    @property
+    def label(self) -> str:
+        return f"fit {self.span[0]}-{self.span[1] - 1}"
+
+    def build(self, work: Work) -> Notes:
+        segment, figures = fit_segment(
+            KeyState.load(work.path(self.key)),
+            Footage(self.take, work.site).open_views(),
+            range(*self.span),
+            motion=MotionCache.load(work.path(self.motion) / MOTION),
+            options=self.options,
+            scratch=work.scratch,
+            progress=work.progress,
+        )
+        hold_absent(segment).save(work.out / SEGMENT)
+        write_json(work.out / FIGURES, {"frames": figures})
+        return {"frames": len(segment), "gaussians": len(segment.key), "dynamic": int(segment.dynamic.sum())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CutSegment(Stage):
+    """The first frames of a segment, as a segment."""
+
+    name, version = "segment", 6
+    segment: Key
+    frames: int
+
+    def build(self, work: Work) -> Notes:
+        folder, frames = work.path(self.segment), self.frames
+        whole = Segment.load(folder / SEGMENT)
+        part = replace(whole, xyz=whole.xyz[: frames - 1], attributes=whole.attributes[: frames - 1])
+        part.save(work.out / SEGMENT)
+        figures = json.loads((folder / FIGURES).read_text())["frames"][: frames - 1]
+        write_json(work.out / FIGURES, {"frames": figures})
+        return {"frames": frames, "gaussians": len(part.key), "dynamic": int(part.dynamic.sum())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasureSeam(Stage):
+    """Measure how much the border between a keyframe's segment and the keyframe `after` it shows: seam.json."""
+
+    name, version = "seam", 2
+    take: Take
+    key: Key
+    segment: Key
+    after: Key
+
+    def build(self, work: Work) -> Notes:
+        before, after = (KeyState.load(work.path(key)) for key in (self.key, self.after))
+        views = Footage(self.take, work.site).open_views()
+        found = seam(before, Segment.load(work.path(self.segment) / SEGMENT), after, views)
+        facts = {"ratio": found if math.isfinite(found) else None}
+        write_json(work.out / SEAM, facts)
+        return facts
+
+
+def background_of(take: Take, options: BackgroundOptions) -> FindBackground:
+    """The stage for a take; how much of a fit the background gets changes nothing of what it is."""
+    return FindBackground(take=take, options=replace(options, iteration_share=BackgroundOptions().iteration_share))
 
 
 def count_pictures(workshop: Workshop, plan: Plan, groups: Key, instants: Sequence[int]) -> list[int]:
@@ -49,272 +202,20 @@ def count_pictures(workshop: Workshop, plan: Plan, groups: Key, instants: Sequen
     return [int((found.frames[first + instant, columns] >= 0).sum()) for instant in instants]
 
 
-def find_background(
-    workshop: Workshop, plan: Plan, groups: Key, points: Key, pictures: PictureOptions, options: BackgroundOptions
-) -> Key | None:
-    """Find what stands still in each fitted camera: stills.npz. None where the options ask for no background."""
-    if not options.iteration_share:
-        workshop.listener.skipped("background", "fit.background.iteration_share is 0")
-        return None
-    options = replace(options, iteration_share=BackgroundOptions().iteration_share)  # how it is used changes nothing
-    arguments = {
-        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
-        "options": options,
-    }
-    reads = {
-        "background": options,
-        "pictures": pictures,
-        "cameras": plan.fitted,
-        "first": plan.first,
-        "stop": plan.stop,
-    }
-    inputs = {"groups": groups, "points": points}
-    return workshop.make("background", VERSION, reads, inputs, "tasks.stages.fitting:build_background", arguments)
-
-
-def fit_first(
-    workshop: Workshop,
-    plan: Plan,
-    groups: Key,
-    points: Key,
-    background: Key | None,
-    instant: int,
-    pictures: PictureOptions,
-    motion: MotionOptions,
-    options: FitOptions,
-) -> Key:
-    """Fit the keyframe that the chain starts with: state.npz and key.json, with the quantizer of all."""
-    options = _without(options, "key_iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "labels")
-    arguments = {
-        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
-        "points": workshop.path(points) / POINTS,
-        "background": _stills_path(workshop, background),
-        "instant": instant,
-        "motion": motion,
-        "options": options,
-    }
-    reads = {**_reads(plan, pictures, options), "instant": instant, "motion": motion}
-    inputs = {"groups": groups, "points": points, **({"background": background} if background else {})}
-    return workshop.make(
-        "key", VERSION, reads, inputs, "tasks.stages.fitting:build_first", arguments, label=f"fit key {instant}"
-    )
-
-
-def fit_next(
-    workshop: Workshop,
-    plan: Plan,
-    groups: Key,
-    points: Key,
-    background: Key | None,
-    previous: Key,
-    end: Key | None,
-    step: tuple[int, int],
-    pictures: PictureOptions,
-    motion: MotionOptions,
-    options: FitOptions,
-) -> Key:
-    """Fit the keyframe at instant `step[1]` from the one at `step[0]`, or from the last frame of its segment `end`."""
-    options = _without(
-        options, "iterations", "frame_iterations", "frame_rate_scale", "settle", "lift", "shell", "background"
-    )
-    arguments = {
-        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
-        "previous": workshop.path(previous),
-        "end": workshop.path(end) / SEGMENT if end else None,
-        "background": _stills_path(workshop, background),
-        "instant": step[1],
-        "motion": motion,
-        "options": options,
-    }
-    reads = {**_reads(plan, pictures, options), "motion": motion, "step": step}
-    inputs = {"groups": groups, "points": points, "previous": previous}
-    inputs |= {"background": background} if background else {}
-    inputs |= {"end": end} if end else {}
-    label = f"fit key {step[1]}{f' after {step[0]}' if end else ''}"
-    return workshop.make("key", VERSION, reads, inputs, "tasks.stages.fitting:build_next", arguments, label=label)
-
-
-def fit_segment(
-    workshop: Workshop,
-    plan: Plan,
-    groups: Key,
-    points: Key,
-    motion: Key,
-    key: Key,
-    span: range,
-    pictures: PictureOptions,
-    options: FitOptions,
-) -> Key:
-    """Fit the instants of a segment, which starts with its keyframe: segment.npz and fit.json."""
-    options = _without(
-        options, "iterations", "key_iterations", "coarse_share", "float_share", "start", "shell", "background"
-    )
-    arguments = {
-        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
-        "key": workshop.path(key),
-        "motion": workshop.path(motion) / MOTION,
-        "span": (span.start, span.stop),
-        "options": options,
-    }
-    reads = {**_reads(plan, pictures, options), "span": (span.start, span.stop)}
-    inputs = {"groups": groups, "points": points, "motion": motion, "key": key}
-    label = f"fit {span.start}-{span.stop - 1}"
-    return workshop.make(
-        "segment", VERSION, reads, inputs, "tasks.stages.fitting:build_segment", arguments, label=label
-    )
-
-
-def measure_seam(
-    workshop: Workshop,
-    plan: Plan,
-    groups: Key,
-    points: Key,
-    key: Key,
-    segment: Key,
-    after: Key,
-    pictures: PictureOptions,
-) -> Key:
-    """Measure how much the border between a keyframe's segment and the keyframe `after` it shows: seam.json."""
-    arguments = {
-        "footage": footage_of(workshop, plan, groups, points, cameras=plan.fitted, pictures=pictures),
-        "key": workshop.path(key),
-        "segment": workshop.path(segment) / SEGMENT,
-        "after": workshop.path(after),
-    }
-    reads = {"pictures": pictures, "cameras": plan.fitted, "first": plan.first}
-    inputs = {"groups": groups, "points": points, "key": key, "segment": segment, "after": after}
-    return workshop.make("seam", VERSION, reads, inputs, "tasks.stages.fitting:build_seam", arguments)
-
-
-def read_seam(workshop: Workshop, key: Key) -> float | None:
+def read_seam(folder: Path) -> float | None:
     """Flicker across a border over that before it; None where nobody can tell."""
-    return json.loads((workshop.path(key) / SEAM).read_text())["ratio"]
+    ratio: float | None = json.loads((folder / SEAM).read_text())["ratio"]
+    return ratio
 
 
-def read_losses(workshop: Workshop, segment: Key) -> list[float]:
+def read_losses(folder: Path) -> list[float]:
     """Loss of each frame after a segment's keyframe, NaN where nothing moved."""
-    frames = json.loads((workshop.path(segment) / FIGURES).read_text())["frames"]
+    frames = json.loads((folder / FIGURES).read_text())["frames"]
     return [frame.get("loss", math.nan) for frame in frames]
 
 
-def cut_segment(workshop: Workshop, segment: Key, frames: int) -> Key:
-    """The first frames of a segment, as a segment."""
-    arguments = {"segment": workshop.path(segment), "frames": frames}
-    inputs = {"segment": segment}
-    return workshop.make("segment", VERSION, {"frames": frames}, inputs, "tasks.stages.fitting:build_cut", arguments)
-
-
-def build_background(footage: Footage, options: BackgroundOptions, out: Path, progress: Progress) -> dict[str, Any]:
-    """The job behind `find_background`."""
-    stills = measure_background(footage.open_views(), options, progress)
-    save_stills(out / STILLS, stills)
-    return {"cameras": len(stills), "known_share": float(np.mean([still.known.mean() for still in stills] or [0]))}
-
-
-def build_first(
-    footage: Footage,
-    points: Path,
-    background: Path | None,
-    instant: int,
-    motion: MotionOptions,
-    options: FitOptions,
-    out: Path,
-    progress: Progress,
-) -> dict[str, Any]:
-    """The job behind `fit_first`."""
-    known = _sure_points(SparsePoints.load(points)) if points.exists() else None
-    state = keyframe.fit_first(
-        footage.open_views(),
-        instant,
-        points=known,
-        stills=_stills(background),
-        motion=motion,
-        options=options,
-        progress=progress,
-    )
-    state.save(out)
-    return dict(state.figures)
-
-
-def build_next(
-    footage: Footage,
-    previous: Path,
-    end: Path | None,
-    background: Path | None,
-    instant: int,
-    motion: MotionOptions,
-    options: FitOptions,
-    out: Path,
-    progress: Progress,
-) -> dict[str, Any]:
-    """The job behind `fit_next`."""
-    views, before = footage.open_views(), KeyState.load(previous)
-    if end:
-        before = tail(before, Segment.load(end))
-    masks = _changes(views, before.instant, instant, motion)
-    state = keyframe.fit_next(
-        before,
-        views,
-        instant,
-        masks=masks,
-        stills=_stills(background),
-        motion=motion,
-        options=options,
-        progress=progress,
-    )
-    state.save(out)
-    return dict(state.figures)
-
-
-def build_segment(
-    footage: Footage,
-    key: Path,
-    motion: Path,
-    span: tuple[int, int],
-    options: FitOptions,
-    out: Path,
-    scratch: Path,
-    progress: Progress,
-) -> dict[str, Any]:
-    """The job behind `fit_segment`."""
-    segment, figures = frames.fit_segment(
-        KeyState.load(key),
-        footage.open_views(),
-        range(*span),
-        motion=MotionCache.load(motion),
-        options=options,
-        scratch=scratch,
-        progress=progress,
-    )
-    hold_absent(segment).save(out / SEGMENT)
-    write_json(out / FIGURES, {"frames": figures})
-    return {"frames": len(segment), "gaussians": len(segment.key), "dynamic": int(segment.dynamic.sum())}
-
-
-def build_seam(footage: Footage, key: Path, segment: Path, after: Path, out: Path) -> dict[str, Any]:
-    """The job behind `measure_seam`."""
-    found = seam(KeyState.load(key), Segment.load(segment), KeyState.load(after), footage.open_views())
-    facts = {"ratio": found if math.isfinite(found) else None}
-    write_json(out / SEAM, facts)
-    return facts
-
-
-def build_cut(segment: Path, frames: int, out: Path) -> dict[str, Any]:
-    """The job behind `cut_segment`."""
-    whole = Segment.load(segment / SEGMENT)
-    part = replace(whole, xyz=whole.xyz[: frames - 1], attributes=whole.attributes[: frames - 1])
-    part.save(out / SEGMENT)
-    figures = json.loads((segment / FIGURES).read_text())["frames"][: frames - 1]
-    write_json(out / FIGURES, {"frames": figures})
-    return {"frames": frames, "gaussians": len(part.key), "dynamic": int(part.dynamic.sum())}
-
-
-def _stills_path(workshop: Workshop, background: Key | None) -> Path | None:
-    return workshop.path(background) / STILLS if background else None
-
-
-def _stills(path: Path | None) -> list[Still]:
-    return load_stills(path) if path else []
+def _stills(work: Work, background: Key | None) -> list[Still]:
+    return load_stills(work.path(background) / STILLS) if background else []
 
 
 def _sure_points(sparse: SparsePoints) -> Points:
@@ -325,20 +226,3 @@ def _sure_points(sparse: SparsePoints) -> Points:
 
 def _changes(views: Views, first: int, last: int, options: MotionOptions) -> list[np.ndarray | None]:
     return [changed_between(views, camera, first, last, options) for camera in range(len(views.cameras))]
-
-
-def _reads(plan: Plan, pictures: PictureOptions, options: FitOptions) -> dict[str, Any]:
-    """Instants count from the plan's first one."""
-    return {
-        "fit": options,
-        "fit_version": keyframe.VERSION,
-        "pictures": pictures,
-        "cameras": plan.fitted,
-        "first": plan.first,
-    }
-
-
-def _without(options: FitOptions, *unread: str) -> FitOptions:
-    """Options with those fields at their defaults that a stage does not read, so that they cannot change its key."""
-    defaults = FitOptions()
-    return replace(options, **{name: getattr(defaults, name) for name in unread})

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from calibration.rig import Camera, Rig
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera
+from packuv.footage.reader import FrameReader
 from packuv.footage.views import Views
 from sync.align import FrameGroups
 from sync.capture import find_capture
+from tasks.artefacts.stage import Site
 from tasks.artefacts.store import Key
-from tasks.artefacts.workshop import Workshop
-from tasks.stages.plan import Plan
 from tasks.stages.synchronize import selected
 
 RIG = "rig.json"
@@ -35,59 +34,60 @@ class PictureOptions:
             raise ValueError(f"max_width must be at least 16 pixels, but is {self.max_width}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Take:
+    """Which pictures a stage looks at."""
+
+    groups: Key
+    rig: Key | None = None
+    """Artefact with rig.json; None for who looks at pictures as filmed"""
+    cameras: tuple[str, ...]
+    """In this order"""
+    first: int = 0
+    """First instant of the capture; instants of the views count from here"""
+    stop: int | None = None
+    """The instant after the last one; None, to the end, for a stage that is told its instants"""
+    pictures: PictureOptions = PictureOptions()
+
+
 @dataclass(frozen=True)
 class Footage:
-    """Where pictures come from; plain values, so that a job can be told."""
+    """A take where a job finds it."""
 
-    capture: Path
-    """Capture folder"""
-    groups: Path
-    """Folder of the sync artefact"""
-    rig: Path
-    """Folder with rig.json"""
-    cameras: tuple[str, ...]
-    """Cameras to show, in this order"""
-    first: int
-    """First instant of the capture; instants of the views count from here"""
-    stop: int | None
-    max_width: int | None = None
+    take: Take
+    site: Site
 
     def load_groups(self) -> FrameGroups:
         """The selected instants of all cameras."""
-        groups = FrameGroups.load(self.groups)
-        chosen = selected(groups, self.first, self.stop)
+        groups = FrameGroups.load(self.site.path(self.take.groups))
+        chosen = selected(groups, self.take.first, self.take.stop)
         rows = slice(chosen.start, chosen.stop)
         return FrameGroups(
             groups.cameras, groups.reference, groups.times_ns[rows], groups.frames[rows], groups.residuals_ns[rows]
         )
 
     def load_rig(self) -> Rig:
-        """The rig of `cameras`."""
-        return Rig.load(self.rig / RIG).select(self.cameras)
+        """The rig of the cameras."""
+        assert self.take.rig is not None, "this take is looked at as filmed"
+        return Rig.load(self.site.path(self.take.rig) / RIG).select(self.take.cameras)
 
     def open_views(self, cameras: Sequence[str] | None = None) -> Views:
-        """Undistorted, colour-balanced pictures of `cameras`, by default all of this footage."""
-        names = self.cameras if cameras is None else tuple(cameras)
+        """Undistorted, colour-balanced pictures of `cameras`, by default all of this take."""
+        names = self.take.cameras if cameras is None else tuple(cameras)
         groups, rig = self.load_groups(), self.load_rig()
         columns = [groups.cameras.index(name) for name in names]
-        videos = find_capture(self.capture).videos
+        videos = find_capture(self.site.capture).videos
         lenses = [lens_camera(rig[name]) for name in names]
-        return Views(videos, np.ascontiguousarray(groups.frames[:, columns]), lenses, max_width=self.max_width)
+        frames = np.ascontiguousarray(groups.frames[:, columns])
+        return Views(videos, frames, lenses, max_width=self.take.pictures.max_width)
 
-
-def footage_of(
-    workshop: Workshop,
-    plan: Plan,
-    groups: Key,
-    rig: Key,
-    *,
-    cameras: Sequence[str],
-    pictures: PictureOptions | None = None,
-) -> Footage:
-    """Pictures of these cameras in a plan's instants, with the rig of an artefact; without options as filmed."""
-    max_width = pictures.max_width if pictures else None
-    folders = workshop.path(groups), workshop.path(rig)
-    return Footage(plan.capture, *folders, tuple(cameras), plan.first, plan.stop, max_width)
+    def filmed(self, instant: int) -> dict[str, np.ndarray]:
+        """Pictures as filmed, uint8 [H, W, 3] RGB, of the cameras that have one at this instant of the take."""
+        groups, videos = self.load_groups(), find_capture(self.site.capture).videos
+        names = self.take.cameras
+        reader = FrameReader({name: videos[name] for name in names})
+        numbers = {name: int(groups.frames[instant, groups.cameras.index(name)]) for name in names}
+        return {name: reader.read(name, number) for name, number in numbers.items() if number >= 0}
 
 
 def lens_camera(camera: Camera) -> LensCamera:

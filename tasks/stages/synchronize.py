@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,37 +14,46 @@ from sync.align import AlignOptions, FrameGroups, SyncReport, align, build_index
 from sync.capture import Capture, find_capture, load_timecodes
 from sync.probe import VideoInfo, probe_video
 from tasks.artefacts.recipe import write_json
-from tasks.artefacts.store import Key
+from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.plan import Plan
-
-VERSION = 1
 
 
-def synchronize(workshop: Workshop, plan: Plan, options: AlignOptions) -> Key:
+@dataclass(frozen=True, kw_only=True)
+class Synchronize(Stage):
     """Match the frames of all cameras: sync.json, groups.arrow, videos.json and the AVL index of each camera."""
-    capture = find_capture(plan.capture)
-    settings = capture.settings
-    reads = {"align": options, "fps": settings.fps, "timecode_column": settings.timecode_column}
-    inputs = {
-        "videos": workshop.digests(capture.videos, "reading videos"),
-        "timecodes": workshop.digests(capture.timecodes, "reading timecodes"),
-    }
-    arguments = {"capture": plan.capture, "options": options}
-    return workshop.make("sync", VERSION, reads, inputs, "tasks.stages.synchronize:build", arguments)
+
+    name, version = "sync", 2
+    videos: Files
+    timecodes: Files
+    fps: Fraction | None
+    """What capture.toml says"""
+    timecode_column: str | None
+    """Likewise"""
+    options: AlignOptions
+
+    def build(self, work: Work) -> Notes:
+        found = find_capture(work.site.capture)
+        infos = _probe_all(found, work.progress)
+        timecodes = load_timecodes(found, infos)
+        groups, report = align(timecodes, self.options)
+        groups.save(work.out, report)
+        save_index(build_index(timecodes, report.clocks), work.out)
+        videos = {camera: _info_to_json(info) for camera, info in infos.items()}
+        rate = found.settings.fps or _nominal_rate(infos, report)
+        write_json(work.out / "videos.json", {"rate": rate, "videos": videos})
+        return {"instants": len(groups), "cameras": len(groups.cameras), "reference": groups.reference}
 
 
-def build(capture: Path, options: AlignOptions, out: Path, progress: Progress) -> dict[str, Any]:
-    """Match the frames of a capture folder; the job behind `synchronize`."""
-    found = find_capture(capture)
-    infos = _probe_all(found, progress)
-    timecodes = load_timecodes(found, infos)
-    groups, report = align(timecodes, options)
-    groups.save(out, report)
-    save_index(build_index(timecodes, report.clocks), out)
-    videos = {camera: _info_to_json(info) for camera, info in infos.items()}
-    write_json(out / "videos.json", {"rate": found.settings.fps or _nominal_rate(infos, report), "videos": videos})
-    return {"instants": len(groups), "cameras": len(groups.cameras), "reference": groups.reference}
+def synchronize(workshop: Workshop, options: AlignOptions) -> Synchronize:
+    """The stage for a workshop's capture; cost: reading the files that changed since the last time."""
+    capture = find_capture(workshop.capture)
+    return Synchronize(
+        videos=workshop.files(capture.videos, "reading videos"),
+        timecodes=workshop.files(capture.timecodes, "reading timecodes"),
+        fps=capture.settings.fps,
+        timecode_column=capture.settings.timecode_column,
+        options=options,
+    )
 
 
 def selected(groups: FrameGroups, first: int, stop: int | None) -> range:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,90 +12,65 @@ import numpy as np
 
 from packuv.files import write_json
 from packuv.motion.cache import MotionCache, measure_motion
-from packuv.motion.keyframes import KeyframeOptions, motion_curve, segments
-from packuv.motion.keyframes import choose_keyframes as choose
+from packuv.motion.keyframes import KeyframeOptions, choose_keyframes, motion_curve, segments
 from packuv.motion.step import MotionOptions
-from packuv.progress import Progress
 from tasks.artefacts.recipe import digest
+from tasks.artefacts.stage import Notes, Stage, Work
 from tasks.artefacts.store import Key
-from tasks.artefacts.workshop import Workshop
-from tasks.stages.footage import Footage, PictureOptions, footage_of
-from tasks.stages.plan import Plan
+from tasks.stages.footage import Footage, Take
 
-MOTION_VERSION = 1
-KEYFRAMES_VERSION = 1
 MOTION, KEYFRAMES = "motion", "keyframes.json"
 
 
-def find_motion(
-    workshop: Workshop, plan: Plan, groups: Key, rig: Key, pictures: PictureOptions, options: MotionOptions
-) -> Key:
-    """Measure flow and motion masks of the fitted cameras."""
-    arguments = {
-        "footage": footage_of(workshop, plan, groups, rig, cameras=plan.fitted, pictures=pictures),
-        "options": options,
-        "workers": workshop.jobs.threads,
-    }
-    reads = {
-        "motion": options,
-        "pictures": pictures,
-        "cameras": plan.fitted,
-        "first": plan.first,
-        "stop": plan.stop,
-    }
-    inputs = {"groups": groups, "rig": rig}
-    return workshop.make(
-        "motion", MOTION_VERSION, reads, inputs, "tasks.stages.track:build_motion", arguments, label="flow"
-    )
+@dataclass(frozen=True, kw_only=True)
+class FindMotion(Stage):
+    """Measure optical flow and motion masks of the fitted cameras."""
+
+    name, version = "motion", 2
+    take: Take
+    options: MotionOptions
+
+    def build(self, work: Work) -> Notes:
+        # The measurement knows the videos by their paths: a capture that was moved between two attempts starts afresh.
+        folder = work.scratch / digest(str(work.site.capture))[:16]
+        views = Footage(self.take, work.site).open_views()
+        cache = measure_motion(views, folder, self.options, workers=work.site.threads, progress=work.progress)
+        folder.rename(work.out / MOTION)
+        return {"pictures": int((cache.previous >= 0).sum()), "moving_share": float(np.nanmean(_shares(cache)))}
 
 
-def choose_keyframes(workshop: Workshop, motion: Key, options: KeyframeOptions) -> Key:
+@dataclass(frozen=True, kw_only=True)
+class ChooseKeyframes(Stage):
     """Choose keyframes from the motion curve; segments in which nothing moves are named, since nobody fits them."""
-    arguments = {"motion": workshop.path(motion) / MOTION, "options": options}
-    inputs = {"motion": motion}
-    key = workshop.make(
-        "keyframes", KEYFRAMES_VERSION, options, inputs, "tasks.stages.track:build_keyframes", arguments
-    )
-    for still in read_still(workshop.path(key)):
-        why = f"nothing moves in instants {still.start} to {still.stop - 1}; each repeats the keyframe"
-        workshop.listener.skipped(f"fit {still.start}-{still.stop - 1}", why)
-    return key
 
+    name, version = "keyframes", 2
+    motion: Key
+    options: KeyframeOptions
 
-def build_motion(
-    footage: Footage, options: MotionOptions, workers: int, out: Path, scratch: Path, progress: Progress
-) -> dict[str, Any]:
-    """The job behind `find_motion`."""
-    # The measurement knows the videos by their paths, so a capture that was moved between two attempts starts afresh.
-    folder = scratch / digest(str(footage.capture))[:16]
-    views = footage.open_views()
-    cache = measure_motion(views, folder, options, workers=workers, progress=progress)
-    folder.rename(out / MOTION)
-    return {"pictures": int((cache.previous >= 0).sum()), "moving_share": float(np.nanmean(_shares(cache)))}
-
-
-def build_keyframes(motion: Path, options: KeyframeOptions, out: Path) -> dict[str, Any]:
-    """The job behind `choose_keyframes`."""
-    cache = MotionCache.load(motion)
-    curve = motion_curve(cache.magnitude, cache.names, options)
-    keyframes = choose(curve, options)
-    spans = segments(keyframes, len(curve))
-    moving = np.nan_to_num(_shares(cache)).max(axis=1) > 0  # [T]
-    write_json(
-        out / KEYFRAMES,
-        {
+    def build(self, work: Work) -> Notes:
+        cache = MotionCache.load(work.path(self.motion) / MOTION)
+        curve = motion_curve(cache.magnitude, cache.names, self.options)
+        keyframes = choose_keyframes(curve, self.options)
+        spans = segments(keyframes, len(curve))
+        moving = np.nan_to_num(_shares(cache)).max(axis=1) > 0  # [T]
+        facts = {
             "keyframes": [{"instant": item.instant, "reason": str(item.reason)} for item in keyframes],
             "spans": [[span.start, span.stop] for span in spans],
             "still": [not bool(moving[span.start + 1 : span.stop].any()) for span in spans],
             "curve_px": curve.tolist(),
-        },
-    )
-    return {"keyframes": len(keyframes), "instants": len(curve)}
+        }
+        write_json(work.out / KEYFRAMES, facts)
+        return {"keyframes": len(keyframes), "instants": len(curve)}
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        for still in read_still(folder):
+            why = f"nothing moves in instants {still.start} to {still.stop - 1}; each repeats the keyframe"
+            yield f"fit {still.start}-{still.stop - 1}", why
 
 
-def read_spans(workshop: Workshop, keyframes: Key) -> list[range]:
+def read_spans(folder: Path) -> list[range]:
     """Instants of each segment."""
-    return [range(*span) for span in _read(workshop.path(keyframes))["spans"]]
+    return [range(*span) for span in _read(folder)["spans"]]
 
 
 def read_still(folder: Path) -> list[range]:

@@ -185,7 +185,7 @@ def test_an_earlier_stop_and_another_seed(first, capture):
     stopped, _ = run(request(capture, out, stop_after="flow", seed=1))
     assert made(stopped) == set()  # nothing before the fit reads the seed
     assert stopped.scene is None
-    assert set(artefacts(stopped)) == {"sync", "rig", "points", "flow", "keyframes"}
+    assert set(artefacts(stopped)) == {"sync", "rig", "points", "motion", "keyframes"}
 
 
 def test_flow_shows_what_was_skipped(workflow, first, capture):
@@ -265,22 +265,25 @@ def test_a_run_that_stops_leaves_the_finished_segments_as_a_scene_that_plays(fir
     with ThreadPoolExecutor(max_workers=2) as pool:
 
         def stop_at(stage: str, count: int):
-            def submit(function, *arguments):
-                started.append(function.__name__)
-                if started.count(stage) == count:
-                    raise KeyboardInterrupt
-                future = pool.submit(function, *arguments)
-                if stage == "encode":
-                    future.result()
-                return future
+            def engine(make):
+                def submit(asked):
+                    started.append(type(asked).__name__)
+                    if started.count(stage) == count:
+                        raise KeyboardInterrupt
+                    future = pool.submit(make, asked)
+                    if stage == "Encode":
+                        future.result()
+                    return future
 
-            return submit
+                return submit
+
+            return engine
 
         with pytest.raises(KeyboardInterrupt):
-            process(asked, Journal(TerminalProgress(io.StringIO())), stop_at("fit_segment", 1))
+            process(asked, Journal(TerminalProgress(io.StringIO())), stop_at("FitSegment", 1))
         assert not partial.exists()
         with pytest.raises(KeyboardInterrupt):
-            process(asked, Journal(TerminalProgress(io.StringIO())), stop_at("encode", 1))
+            process(asked, Journal(TerminalProgress(io.StringIO())), stop_at("Encode", 1))
     with open_scene(partial) as scene:
         assert len(scene) == FRAMES
     whole, _ = run(asked)

@@ -8,13 +8,16 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from packuv.progress import no_progress
 from pipelines.server import workflow_server
 from tasks.artefacts.jobs import JobDiedError, JobError
-from tasks.artefacts.store import Key, Store, Workspace
+from tasks.artefacts.stage import Notes, Site, Stage, Work
+from tasks.artefacts.store import Building, Key, Store
 
 
 @pytest.mark.parametrize(
@@ -47,23 +50,38 @@ def test_flow_skips_retries_and_gives_up(workflow, tmp_path, monkeypatch):
     store = Store(tmp_path)
     monkeypatch.setattr(engine, "BACKOFF_SECONDS", 0.01)
 
-    def flaky(name: str, failures: int, error: Exception) -> Key:
-        def build(workspace: Workspace):
-            attempts.append(name)
-            if attempts.count(name) <= failures:
-                raise error
-            (workspace.out / "done").write_text(name)
+    failing: dict[str, tuple[int, Exception]] = {}
 
-        return store.make(name, 1, None, {}, build)
+    @dataclass(frozen=True, kw_only=True)
+    class Flaky(Stage):
+        """Fails as often as asked."""
+
+        name, version = "flaky", 1
+        call: str
+
+        def build(self, work: Work) -> Notes:
+            attempts.append(self.call)
+            failures, error = failing[self.call]
+            if attempts.count(self.call) <= failures:
+                raise error
+            return {}
+
+    def make(stage: Stage) -> Key:
+        def build(building: Building) -> None:
+            stage.build(Work(Site(tmp_path, tmp_path, 1), building.out, building.scratch, no_progress))
+            (building.out / "done").write_text("yes")
+
+        return store.make(stage.name, stage.version, stage.settings, stage.sources, build)
 
     @flow(persist_result=False)
-    def run(*arguments):
-        future = engine.submit(flaky, *arguments)
+    def run(call: str, failures: int, error: Exception):
+        failing[call] = failures, error
+        future = engine.submitter(make)(Flaky(call=call))
         future.wait()
         return future.state.name, future.state.result(raise_on_failure=False)
 
     hiccup = OSError(5, "input/output error")
-    assert run("good", 0, hiccup) == ("Completed", Key("good", store.key("good", 1, None, {}).digest))
+    assert run("good", 0, hiccup) == ("Completed", store.key("flaky", 1, {"call": "good"}, {}))
     assert run("good", 0, hiccup)[0] == "Skipped"
     assert attempts == ["good"]
     assert run("flaky", 2, hiccup)[0] == "Completed"

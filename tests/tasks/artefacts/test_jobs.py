@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import signal
@@ -10,6 +11,8 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,6 +26,7 @@ from __future__ import annotations
 import os, signal, subprocess, sys, time
 from dataclasses import dataclass
 from pathlib import Path
+from tasks.artefacts.stage import Stage
 
 @dataclass(frozen=True)
 class Size:
@@ -32,19 +36,28 @@ class Size:
 class CaptureError(ValueError):
     pass
 
-def area(size: Size, names: tuple[str, ...], out: Path, progress):
+def area(progress, size: Size, names: tuple[str, ...], out: Path):
     progress(1, 2, "half")
     (out / "area.txt").write_text(str(size.width * size.height))
     return {"names": list(names), "threads": os.environ["NUMBA_NUM_THREADS"], "pid": os.getpid()}
 
-def bad_input(): raise CaptureError("cam03 has no frames")
-def missing(): raise FileNotFoundError(2, "no such thing", "cam03.mp4")
-def full(): raise OSError(28, "No space left on device")
-def bug(): return {}["key"]
-def dies(): os.kill(os.getpid(), signal.SIGKILL)
-def says(): print("said by the job"); sys.stdout.flush(); sys.exit(3)
+def bad_input(progress): raise CaptureError("cam03 has no frames")
+def missing(progress): raise FileNotFoundError(2, "no such thing", "cam03.mp4")
+def full(progress): raise OSError(28, "No space left on device")
+def bug(progress): return {}["key"]
+def dies(progress): os.kill(os.getpid(), signal.SIGKILL)
+def says(progress): print("said by the job"); sys.stdout.flush(); sys.exit(3)
 
-def sleeps(mark: Path):
+@dataclass(frozen=True, kw_only=True)
+class Area(Stage):
+    name, version = "area", 1
+    size: Size
+    fails: bool = False
+
+    def build(self, work):
+        return bad_input(work.progress) if self.fails else area(work.progress, self.size, ("cam00",), work.out)
+
+def sleeps(progress, mark: Path):
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     mark.write_text(f"{os.getpid()} {child.pid}")
     time.sleep(60)
@@ -64,8 +77,16 @@ class Quiet:
 @pytest.fixture
 def jobs(tmp_path, monkeypatch):
     (tmp_path / "packuv_test_work.py").write_text(WORK)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "packuv_test_work", raising=False)
     return Jobs(threads=3)
+
+
+@pytest.fixture
+def work(jobs):
+    """The module that jobs are taken from."""
+    return importlib.import_module("packuv_test_work")
 
 
 def gone(pid: int, *, seconds: float = 5) -> bool:
@@ -89,16 +110,17 @@ def read_pids(mark: Path) -> list[int]:
     raise AssertionError("the job did not start")
 
 
-def test_arguments_results_and_progress_cross_over(jobs, tmp_path):
+def test_arguments_results_and_progress_cross_over(jobs, work, tmp_path):
     seen = []
-    arguments = {"size": {"width": 3}, "names": ("cam00", "cam01"), "out": tmp_path, "scratch": tmp_path}
-    done = jobs.run("packuv_test_work:area", arguments, folder=tmp_path, progress=lambda *values: seen.append(values))
+    job = partial(work.area, size=work.Size(3), names=("cam00", "cam01"), out=tmp_path)
+    done = jobs.run(job, folder=tmp_path, progress=lambda *values: seen.append(values))
     assert (tmp_path / "area.txt").read_text() == "6"
     assert seen == [(1.0, 2.0, "half")]
     assert done.value["names"] == ["cam00", "cam01"]
     assert done.value["threads"] == "3"
     assert done.value["pid"] != os.getpid()
     assert done.peak_memory_bytes > 1 << 20
+    assert done.cpu.endswith(" lanes")
 
 
 @pytest.mark.parametrize(
@@ -112,20 +134,20 @@ def test_arguments_results_and_progress_cross_over(jobs, tmp_path):
         ("says", JobDiedError, r"ended without a result \(exit code 3\)"),
     ],
 )
-def test_failures_keep_their_kind_and_words(jobs, tmp_path, function, kind, message):
+def test_failures_keep_their_kind_and_words(jobs, work, tmp_path, function, kind, message):
     with pytest.raises(kind, match=message) as caught:
-        jobs.run(f"packuv_test_work:{function}", {}, folder=tmp_path)
+        jobs.run(getattr(work, function), folder=tmp_path)
     assert isinstance(caught.value, JobDiedError) == (kind is JobDiedError)
     log = (tmp_path / "job.log").read_text()
     assert {"bug": "Traceback", "says": "said by the job"}.get(function, "") in log
 
 
-def test_cancel_ends_jobs_and_what_they_started(jobs, tmp_path):
+def test_cancel_ends_jobs_and_what_they_started(jobs, work, tmp_path):
     mark, caught = tmp_path / "mark", []
 
     def run():
         with pytest.raises(CancelledError, match="the same command goes on from here"):
-            jobs.run("packuv_test_work:sleeps", {"mark": mark}, folder=tmp_path)
+            jobs.run(partial(work.sleeps, mark=mark), folder=tmp_path)
         caught.append(True)
 
     thread = threading.Thread(target=run)
@@ -136,15 +158,15 @@ def test_cancel_ends_jobs_and_what_they_started(jobs, tmp_path):
     assert caught == [True]
     assert all(gone(pid) for pid in pids)
     with pytest.raises(CancelledError):
-        jobs.run("packuv_test_work:dies", {}, folder=tmp_path)
+        jobs.run(work.dies, folder=tmp_path)
 
 
 def test_job_dies_with_its_parent(jobs, tmp_path):
     mark = tmp_path / "mark"
     code = (
-        "import sys; from pathlib import Path; from tasks.artefacts.jobs import Jobs\n"
-        "folder = Path(sys.argv[1])\n"
-        "Jobs(threads=1).run('packuv_test_work:sleeps', {'mark': folder / 'mark'}, folder=folder)"
+        "import sys; from functools import partial; from pathlib import Path; from tasks.artefacts.jobs import Jobs\n"
+        "import packuv_test_work; folder = Path(sys.argv[1])\n"
+        "Jobs(threads=1).run(partial(packuv_test_work.sleeps, mark=folder / 'mark'), folder=folder)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) as parent:
         job, grandchild = read_pids(mark)
@@ -155,19 +177,22 @@ def test_job_dies_with_its_parent(jobs, tmp_path):
     assert gone(grandchild)  # ... but the next job in this folder begins alone
 
 
-def test_workshop_makes_an_artefact_by_a_job_and_tells(jobs, tmp_path):
+def test_workshop_makes_an_artefact_by_a_job_and_tells(jobs, work, tmp_path):
     listener = Quiet()
-    workshop = Workshop(Store(tmp_path / "store"), jobs, listener)
-    arguments = {"size": {"width": 3}, "names": ("cam00",)}
+    workshop = Workshop(Store(tmp_path / "store"), tmp_path, jobs, listener)
+    stage = work.Area(size=work.Size(3))
     for _ in range(2):
-        key = workshop.make("fit", 1, {"width": 3}, {}, "packuv_test_work:area", arguments, label="fit 1")
+        key = workshop.make(stage)
     assert key.reused
     assert (workshop.path(key) / "area.txt").read_text() == "6"
-    assert workshop.store.receipt(key).notes["names"] == ["cam00"]
+    receipt = workshop.store.receipt(key)
+    assert receipt.notes["names"] == ["cam00"]
+    assert receipt.cpu.endswith(" lanes")
+    assert receipt.versions["packuv"]
     names = [event[0] for event in listener.events]
     assert names == ["started", "moved", "finished", "started", "finished"]
     with pytest.raises(ValueError, match="no frames"):
-        workshop.make("fit", 1, {}, {}, "packuv_test_work:bad_input", {}, label="fit 2")
-    assert listener.events[-1][:2] == ("failed", "fit 2")
-    spec = json.loads((workshop.store.workspace(workshop.store.key("fit", 1, {}, {})) / "spec.json").read_text())
-    assert spec["function"] == "packuv_test_work:bad_input"
+        workshop.make(replace(stage, fails=True))
+    assert listener.events[-1][:2] == ("failed", "area")
+    (spec,) = (tmp_path / "store" / ".work").glob("*/spec.json")
+    assert "fails=True" in json.loads(spec.read_text())["job"]

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from tasks.artefacts.digests import FileDigests, file_digest
 from tasks.artefacts.recipe import OptionError, canonical, digest, plain, restore
-from tasks.artefacts.store import RECEIPT, Key, Store, Workspace
+from tasks.artefacts.store import RECEIPT, Building, Key, Store
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
 values = st.recursive(
@@ -139,10 +139,10 @@ def test_text_is_read_by_the_declared_type():
 
 
 def writes(text: str, calls: list[str]):
-    def build(workspace: Workspace):
+    def build(building: Building):
         calls.append(text)
-        (workspace.out / "sub").mkdir()
-        (workspace.out / "sub" / "data.txt").write_text(text)
+        (building.out / "sub").mkdir()
+        (building.out / "sub" / "data.txt").write_text(text)
         return {"lines": 1}
 
     return build
@@ -185,14 +185,14 @@ def test_receipt_tells_what_was_made_and_how(tmp_path):
 def test_failed_build_publishes_nothing_and_keeps_its_scratch(tmp_path):
     store = Store(tmp_path)
 
-    def fails(workspace: Workspace):
-        (workspace.out / "half.txt").write_text("half")
-        (workspace.scratch / "checkpoint.txt").write_text("frame 7")
+    def fails(building: Building):
+        (building.out / "half.txt").write_text("half")
+        (building.scratch / "checkpoint.txt").write_text("frame 7")
         raise ValueError("the video ends early")
 
-    def resumes(workspace: Workspace):
-        assert not list(workspace.out.iterdir())
-        (workspace.out / "whole.txt").write_text((workspace.scratch / "checkpoint.txt").read_text())
+    def resumes(building: Building):
+        assert not list(building.out.iterdir())
+        (building.out / "whole.txt").write_text((building.scratch / "checkpoint.txt").read_text())
 
     with pytest.raises(ValueError, match="ends early"):
         store.make("fit", 1, None, {}, fails)
@@ -201,7 +201,7 @@ def test_failed_build_publishes_nothing_and_keeps_its_scratch(tmp_path):
     key = store.make("fit", 1, None, {}, resumes)
     assert sorted(path.name for path in store.path(key).iterdir()) == [RECEIPT, "whole.txt"]
     assert (store.path(key) / "whole.txt").read_text() == "frame 7"
-    assert not store.workspace(key).exists()
+    assert not store.work_folder(key).exists()
 
 
 def test_missing_artefact_is_named(tmp_path):
@@ -246,11 +246,11 @@ import os, sys, time
 from tasks.artefacts.store import Store
 
 root, log = sys.argv[1:]
-def build(workspace):
+def build(building):
     with open(log, "a") as file:
         file.write(f"{os.getpid()}\\n")
     time.sleep(0.3)
-    (workspace.out / "data.txt").write_text("x")
+    (building.out / "data.txt").write_text("x")
 
 sys.stdin.readline()
 Store(root).make("fit", 1, None, {}, build)
@@ -279,14 +279,14 @@ import sys, time
 from pathlib import Path
 from tasks.artefacts.store import Store
 
-def build(workspace):
+def build(building):
     for step in range(5):
-        mark = workspace.scratch / f"{step}.txt"
+        mark = building.scratch / f"{step}.txt"
         if not mark.exists():
             print("step", step, flush=True)
             time.sleep(0.05)
             mark.write_text(str(step * step))
-    (workspace.out / "sum.txt").write_text("+".join((workspace.scratch / f"{s}.txt").read_text() for s in range(5)))
+    (building.out / "sum.txt").write_text("+".join((building.scratch / f"{s}.txt").read_text() for s in range(5)))
 
 Store(sys.argv[1]).make("fit", 1, None, {}, build)
 print("finished", flush=True)

@@ -1,6 +1,8 @@
 """The proof that a scene file holds what was fitted."""
 
+import hashlib
 import json
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -14,8 +16,11 @@ from packuv.scene import EncodeOptions, SceneHeader, open_scene, write_scene
 from packuv.scene.stream import Tolerance
 from sync.align import AlignOptions, align
 from sync.timecode import Timecodes
-from tasks.stages.encode import SCENE, build_scene, build_verification, write_finished
-from tasks.stages.footage import RIG, Footage
+from tasks.artefacts.stage import Site
+from tasks.stages.encode import SCENE, Encode, Verify
+from tasks.stages.fitting import SEGMENT
+from tasks.stages.footage import RIG, Take
+from tests.support.artefacts import build_here, put
 from tests.support.calibration_scene import ring
 
 COLUMNS = attribute_count(0)
@@ -39,44 +44,57 @@ def segments():
 
 
 @pytest.fixture
-def fitted(tmp_path):
-    paths = [tmp_path / "a.npz", tmp_path / "b.npz"]
-    for path, segment in zip(paths, segments(), strict=True):
-        segment.save(path)
-    return paths
+def site(tmp_path):
+    return Site(tmp_path / "store", tmp_path, 1)
+
+
+@pytest.fixture
+def fitted(site):
+    return fit(site, segments())
+
+
+def fit(site, parts):
+    """Artefacts that hold these segments."""
+    return tuple(
+        put(site, "segment", lambda out, part=part: part.save(out / SEGMENT), content=digest(part)) for part in parts
+    )
+
+
+def digest(segment):
+    arrays = (segment.key.xyz, segment.key.attributes, segment.dynamic, segment.xyz, segment.attributes)
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
 
 
 QUANTIZER = Quantizer(np.zeros(3), 1.0, np.ones(3), np.full(COLUMNS, -1.0), np.full(COLUMNS, 1.0))
 
 
 @pytest.fixture
-def footage(tmp_path):
+def take(site):
     """Six instants of three cameras, calibrated."""
     rig = ring(3)
     stamps = Timecodes(np.arange(6, dtype=np.int64) * 10**8, np.arange(6))
     groups, report = align(dict.fromkeys(rig.names, stamps), AlignOptions())
-    groups.save(tmp_path / "groups", report)
-    (tmp_path / "groups/videos.json").write_text('{"rate": "10/1"}')
-    (tmp_path / "points").mkdir()
-    rig.save(tmp_path / "points" / RIG)
-    return Footage(tmp_path, tmp_path / "groups", tmp_path / "points", rig.names, 0, None)
+
+    def synchronized(out):
+        groups.save(out, report)
+        (out / "videos.json").write_text('{"rate": "10/1"}')
+
+    points = put(site, "points", lambda out: rig.save(out / RIG))
+    return Take(groups=put(site, "sync", synchronized), rig=points, cameras=rig.names)
 
 
 @pytest.fixture
-def key(tmp_path, fitted):
-    """The folder of the first keyframe."""
-    folder = tmp_path / "key"
-    folder.mkdir()
-    gaussians = QUANTIZER.decode(Segment.load(fitted[0]).key)
-    KeyState(0, gaussians, QUANTIZER, Bounds(np.zeros(3), 3.0, 0.1), {}).save(folder)
-    return folder
+def key(site):
+    """The first keyframe."""
+    state = KeyState(0, QUANTIZER.decode(segments()[0].key), QUANTIZER, Bounds(np.zeros(3), 3.0, 0.1), {})
+    return put(site, "key", state.save)
 
 
-def test_the_scene_says_how_it_was_filmed(footage, key, fitted, tmp_path):
-    steps, out = [], tmp_path / "out"
-    out.mkdir()
+def test_the_scene_says_how_it_was_filmed(site, take, key, fitted, tmp_path):
+    steps = []
     options = EncodeOptions(Tolerance(10, 1))
-    notes = build_scene(footage, ("cam01",), key, fitted, options, out, lambda done, total, _: steps.append(done))
+    stage = Encode(take=take, held_out=("cam01",), key=key, segments=fitted, options=options)
+    notes, out = build_here(stage, site, tmp_path, lambda done, total, note="": steps.append(done))
     assert notes == json.loads((out / "encode.json").read_text())
     assert notes["frames"] == 6
     assert steps == list(range(1, 13))
@@ -89,39 +107,41 @@ def test_the_scene_says_how_it_was_filmed(footage, key, fitted, tmp_path):
         assert scene.header.extra["near"] == 0.1
 
 
-def test_what_is_fitted_so_far_plays_and_grows_into_the_whole(footage, key, fitted, tmp_path):
+def test_what_is_fitted_so_far_plays_and_grows_into_the_whole(site, take, key, fitted, tmp_path):
     path = tmp_path / "so_far.mkv"
-    assert write_finished(path, footage, (), key, fitted[:1]) == 3
+    whole = Encode(take=take, held_out=(), key=key, segments=fitted, options=EncodeOptions())
+    assert replace(whole, segments=fitted[:1]).write_finished(path, site) == 3
     with open_scene(path) as scene:
         assert len(scene) == 3
-    out = tmp_path / "out"
-    out.mkdir()
-    build_scene(footage, (), key, fitted, EncodeOptions(), out, lambda *_: None)
-    assert write_finished(path, footage, (), key, fitted) == 6
+    _, out = build_here(whole, site, tmp_path)
+    assert whole.write_finished(path, site) == 6
     assert path.read_bytes() == (out / SCENE).read_bytes()
 
 
-def write(path, paths, tolerance=None):
+def write(site, keys, tolerance=None):
+    """A scene file of these segments, as an artefact."""
     header = SceneHeader(QUANTIZER, np.arange(6, dtype=np.int64) * 10**8, Fraction(10))
-    write_scene(path, paths, header, options=EncodeOptions(tolerance or Tolerance()))
-    return path
+    paths = [site.path(key) / SEGMENT for key in keys]
+    options = EncodeOptions(tolerance or Tolerance())
+    return put(site, "encode", lambda out: write_scene(out / SCENE, paths, header, options=options))
 
 
-def verify(scene, paths, out):
+def verify(site, scene, keys, folder):
     steps = []
-    notes = build_verification(scene, paths, out, lambda done, total, note: steps.append((done, total)))
+    stage = Verify(scene=scene, segments=keys)
+    notes, out = build_here(stage, site, folder, lambda done, total, note="": steps.append((done, total)))
     assert steps == [(done, 6) for done in range(1, 7)]
     assert json.loads((out / "verify.json").read_text()) == notes
     return notes
 
 
-def test_a_lossless_scene_holds_every_integer(fitted, tmp_path):
-    notes = verify(write(tmp_path / "scene.mkv", fitted), fitted, tmp_path)
+def test_a_lossless_scene_holds_every_integer(site, fitted, tmp_path):
+    notes = verify(site, write(site, fitted), fitted, tmp_path)
     assert notes == {"frames": 6, "exact": True, "largest_error": {"position": 0, "attribute": 0}}
 
 
-def test_a_lossy_scene_stays_within_what_it_states(fitted, tmp_path):
-    notes = verify(write(tmp_path / "scene.mkv", fitted, Tolerance(10, 1)), fitted, tmp_path)
+def test_a_lossy_scene_stays_within_what_it_states(site, fitted, tmp_path):
+    notes = verify(site, write(site, fitted, Tolerance(10, 1)), fitted, tmp_path)
     assert notes == {"frames": 6, "exact": False, "largest_error": {"position": 10, "attribute": 1}}
 
 
@@ -134,16 +154,15 @@ def test_a_lossy_scene_stays_within_what_it_states(fitted, tmp_path):
         lambda segment: segment.key.attributes.__setitem__((7, 0), segment.key.attributes[7, 0] ^ 1),
     ],
 )
-def test_anything_else_is_refused(fitted, tmp_path, change):
-    scene = write(tmp_path / "scene.mkv", fitted, Tolerance(10, 1))
-    other = segments()[1]
+def test_anything_else_is_refused(site, fitted, tmp_path, change):
+    scene = write(site, fitted, Tolerance(10, 1))
+    first, other = segments()
     change(other)
-    other.save(fitted[1])
     with pytest.raises(RuntimeError, match="does not decode to what was fitted"):
-        build_verification(scene, fitted, tmp_path, lambda *_: None)
+        build_here(Verify(scene=scene, segments=fit(site, [first, other])), site, tmp_path)
 
 
-def test_another_number_of_segments_or_frames_is_refused(fitted, tmp_path):
-    scene = write(tmp_path / "scene.mkv", fitted)
+def test_another_number_of_segments_or_frames_is_refused(site, fitted, tmp_path):
+    scene = write(site, fitted)
     with pytest.raises(RuntimeError, match="has 2 segments, but 1 were fitted"):
-        build_verification(scene, fitted[:1], tmp_path, lambda *_: None)
+        build_here(Verify(scene=scene, segments=fitted[:1]), site, tmp_path)

@@ -1,0 +1,137 @@
+"""What a stage is: one declaration of what it reads, its version and its job.
+
+    @dataclass(frozen=True, kw_only=True)
+    class Count(Stage):
+        name, version = "count", 1
+        groups: Key              # keys of what is read
+        options: CountOptions    # and every setting that changes the result
+
+        def build(self, work: Work) -> Notes:
+            ...                  # reads work.path(self.groups), fills work.out
+
+The recipe, the call and the arguments of the job follow from the fields. A field is a key, digests of files, or plain
+values; so a stage can be pickled, and its job can run on another machine.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from packuv.progress import Progress
+from tasks.artefacts.store import Key, Store
+
+Notes = Mapping[str, Any]
+"""What a stage says about its work, for the receipt; plain values"""
+
+
+@dataclass(frozen=True)
+class Files:
+    """Raw files that a stage reads: what they are called, and what they hold."""
+
+    sha256: Mapping[str, str]
+    """Content digest by name"""
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where the artefacts and the capture of a sequence are, as a job finds them."""
+
+    store: Path
+    capture: Path
+    threads: int
+    """That a job may use"""
+
+    def path(self, key: Key) -> Path:
+        """Folder of a complete artefact; raises FileNotFoundError where there is none."""
+        return Store(self.store).path(key)
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a job is given beside its stage."""
+
+    site: Site
+    out: Path
+    """Empty folder; its files become the artefact"""
+    scratch: Path
+    """Folder that is kept from attempt to attempt"""
+    progress: Progress
+
+    def path(self, key: Key) -> Path:
+        """Folder of a complete artefact; raises FileNotFoundError where there is none."""
+        return self.site.path(key)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage(ABC):
+    """A step of a sequence; see above. Subclasses are frozen dataclasses with keyword-only fields."""
+
+    name: ClassVar[str]
+    """Folder of its artefacts; several stages may make the same kind"""
+    version: ClassVar[int]
+    """Raised with every change that alters what the job makes; tests/tasks/stages/test_golden.py watches"""
+
+    @property
+    def label(self) -> str:
+        """What people are told."""
+        return self.name
+
+    @abstractmethod
+    def build(self, work: Work) -> Notes:
+        """The job: fill `work.out`. ValueError and OSError are for bad input, and reach the user as they are."""
+
+    def spared(self, folder: Path, notes: Notes) -> Iterable[tuple[str, str]]:
+        """Work that this sequence did not need, as (what, why), told by the artefact."""
+        return ()
+
+    @property
+    def sources(self) -> dict[str, Any]:
+        """The fields that name artefacts or files."""
+        return {name: value for name, value in self._fields.items() if _names_artefacts(value)}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The other fields."""
+        return {name: value for name, value in self._fields.items() if not _names_artefacts(value)}
+
+    @property
+    def _fields(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+Job = Callable[[Progress], Any]
+"""Work for a process of its own: something that can be pickled, called with whom to tell"""
+
+
+@dataclass(frozen=True)
+class StageJob:
+    """The job of a stage, ready to be sent to a process or another machine."""
+
+    stage: Stage
+    site: Site
+    out: Path
+    scratch: Path
+
+    def __str__(self) -> str:
+        return self.stage.label
+
+    def __call__(self, progress: Progress) -> Notes:
+        return self.stage.build(Work(self.site, self.out, self.scratch, progress))
+
+
+def _names_artefacts(value: Any) -> bool:
+    """Whether a key or digests of files are in it, at any depth."""
+    match value:
+        case Key() | Files():
+            return True
+        case Mapping():
+            return any(map(_names_artefacts, value.values()))
+        case list() | tuple():
+            return any(map(_names_artefacts, value))
+    if is_dataclass(value) and not isinstance(value, type):
+        return any(_names_artefacts(getattr(value, field.name)) for field in fields(value))
+    return False

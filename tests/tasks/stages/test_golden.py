@@ -1,0 +1,69 @@
+"""Versions that cannot lie: a stage that makes something else of the same input has another version.
+
+SolveRig is not watched: COLMAP needs larger pictures than a test can afford.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+
+import llvmlite.binding
+import pytest
+
+from tasks.artefacts.stage import Stage
+from tasks.stages import calibrate, encode, evaluate, fitting, synchronize, track
+from tests.support import golden
+
+MODULES = (synchronize, calibrate, track, fitting, encode, evaluate)
+
+
+@pytest.mark.slow
+def test_every_stage_makes_what_its_version_stands_for():
+    if not llvmlite.binding.get_host_cpu_features().get("avx2", False):
+        pytest.skip("the recorded digests are those of AVX2 instructions, which this machine lacks")
+    before = json.loads(golden.RECORD.read_text())
+    found = golden.problems(before, golden.measure())
+    assert not found, (
+        f"{'; '.join(f'{stage} {text}' for stage, text in found.items())}. Raise `version` of a stage whose results "
+        "change, then run python -m tests.support.golden --write"
+    )
+
+
+def test_every_stage_is_recorded():
+    kinds = {
+        kind.__name__
+        for module in MODULES
+        for kind in vars(module).values()
+        if inspect.isclass(kind) and issubclass(kind, Stage) and not inspect.isabstract(kind)
+    }
+    recorded = {name.split(",")[0] for name in json.loads(golden.RECORD.read_text())}
+    assert kinds - recorded == {"SolveRig"}
+
+
+ENTRY = {"version": 3, "inputs": "a", "outputs": "b"}
+
+
+@pytest.mark.parametrize(
+    ("now", "text"),
+    [
+        (ENTRY, None),
+        ({**ENTRY, "outputs": "c"}, "still has version 3"),
+        ({**ENTRY, "outputs": "c", "version": 4}, "write the record anew"),
+        ({**ENTRY, "outputs": "c", "inputs": "d"}, "write the record anew"),
+        (None, "no stage any more"),
+    ],
+)
+def test_a_change_without_a_new_version_is_found(now, text):
+    found = golden.problems({"Encode": ENTRY}, {} if now is None else {"Encode": now})
+    assert (found == {}) if text is None else text in found["Encode"]
+
+
+def test_a_record_is_not_written_over_a_lie(monkeypatch, tmp_path):
+    record = tmp_path / "golden.json"
+    record.write_text(json.dumps({"Encode": ENTRY}))
+    monkeypatch.setattr(golden, "RECORD", record)
+    monkeypatch.setattr(golden, "measure", lambda: {"Encode": {**ENTRY, "outputs": "c"}})
+    with pytest.raises(ValueError, match="raise these versions first: Encode"):
+        golden.write()
+    assert json.loads(record.read_text()) == {"Encode": ENTRY}
