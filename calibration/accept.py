@@ -274,15 +274,15 @@ def matches_report(
     explained = float((every <= options.max_error_px).mean()) if len(every) else None
     verdict, reason = _verdict(explained, len(telling), len(rig.cameras), options)
     return MatchesReport(
-        len(telling),
-        len(every),
-        explained,
-        _median([float(np.median(error)) for error in errors]),
-        bad,
-        _bad_cameras(telling, shares, options.bad_share),
-        _median(errors_px),
-        verdict,
-        reason,
+        pairs=len(telling),
+        matches=len(every),
+        explained_share=explained,
+        pair_median_px=_median([float(np.median(error)) for error in errors]),
+        bad_pairs=bad,
+        bad_cameras=_bad_cameras(telling, shares, options.bad_share),
+        reprojection_px=_median(errors_px),
+        verdict=verdict,
+        reason=reason,
     )
 
 

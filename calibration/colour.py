@@ -83,14 +83,14 @@ def balance(points: SparsePoints, *, options: BalanceOptions = BalanceOptions())
     log_gains = _log_gains(data.only(used), cameras, options) if kept else np.zeros((cameras, 3))
     names = points.cameras
     return ColourReport(
-        {name: _triple(np.exp(row)) for name, row in zip(names, log_gains, strict=True)},
-        kept,
-        reason,
-        before,
-        after,
-        len(np.unique(data.point)),
-        dict(zip(names, counts.tolist(), strict=True)),
-        tuple(name for name, enough in zip(names, strong, strict=True) if not enough),
+        gains={name: _triple(np.exp(row)) for name, row in zip(names, log_gains, strict=True)},
+        kept=kept,
+        reason=reason,
+        spread_before=before,
+        spread_after=after,
+        points=len(np.unique(data.point)),
+        observations=dict(zip(names, counts.tolist(), strict=True)),
+        weak_cameras=tuple(name for name, enough in zip(names, strong, strict=True) if not enough),
     )
 
 

@@ -376,15 +376,15 @@ def _caliscope_view(table: Mapping[str, Any]) -> _View:
     rotation = turn if turn.shape == (3, 3) else cv2.Rodrigues(turn)[0]
     # OpenCV calibrates with the top-left pixel's centre at (0, 0), half a pixel from ours.
     camera = Camera(
-        "",
-        int(width),
-        int(height),
-        float(matrix[0, 0]),
-        float(matrix[1, 1]),
-        float(matrix[0, 2]) + 0.5,
-        float(matrix[1, 2]) + 0.5,
-        _pose(rotation, table["translation"], f"camera {number}"),
-        _lens(np.ravel(table["distortions"])),
+        name="",
+        width=int(width),
+        height=int(height),
+        fx=float(matrix[0, 0]),
+        fy=float(matrix[1, 1]),
+        cx=float(matrix[0, 2]) + 0.5,
+        cy=float(matrix[1, 2]) + 0.5,
+        camera_from_world=_pose(rotation, table["translation"], f"camera {number}"),
+        distortion=_lens(np.ravel(table["distortions"])),
     )
     return _View((f"cam_{number}", f"port_{number}", f"cam{number}", str(number)), camera)
 
@@ -466,15 +466,15 @@ def _easymocap_view(name: str, lenses: cv2.FileStorage, poses: cv2.FileStorage) 
         raise ValueError(f"intri.yml must give camera {name!r} its picture size, as H_{name}: 1080 and W_{name}: 1920")
     # OpenCV calibrates with the top-left pixel's centre at (0, 0), half a pixel from ours.
     camera = Camera(
-        "",
-        round(width),
-        round(height),
-        matrix[0, 0],
-        matrix[1, 1],
-        matrix[0, 2] + 0.5,
-        matrix[1, 2] + 0.5,
-        _pose(rotation, shift[:, 0], f"camera {name!r}"),
-        _lens(() if lens is None else np.ravel(lens)),
+        name="",
+        width=round(width),
+        height=round(height),
+        fx=matrix[0, 0],
+        fy=matrix[1, 1],
+        cx=matrix[0, 2] + 0.5,
+        cy=matrix[1, 2] + 0.5,
+        camera_from_world=_pose(rotation, shift[:, 0], f"camera {name!r}"),
+        distortion=_lens(() if lens is None else np.ravel(lens)),
     )
     return _View((name,), camera)
 

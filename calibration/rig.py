@@ -205,14 +205,14 @@ def _camera_from_json(item: Mapping[str, Any]) -> Camera:
     if unknown:
         raise ValueError(f"camera {item.get('name')!r} has the unknown fields {unknown}")
     return Camera(
-        item["name"],
-        item["width"],
-        item["height"],
-        item["fx"],
-        item["fy"],
-        item["cx"],
-        item["cy"],
-        np.asarray(item["camera_from_world"], dtype=np.float64),
-        tuple(item["distortion"]),
-        tuple(item["gains"]),
+        name=item["name"],
+        width=item["width"],
+        height=item["height"],
+        fx=item["fx"],
+        fy=item["fy"],
+        cx=item["cx"],
+        cy=item["cy"],
+        camera_from_world=np.asarray(item["camera_from_world"], dtype=np.float64),
+        distortion=tuple(item["distortion"]),
+        gains=tuple(item["gains"]),
     )

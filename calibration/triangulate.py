@@ -301,17 +301,17 @@ def _joined(
     tint = np.concatenate([part.tint for part in parts])
     whole = Sightings(point.astype(np.int32), camera, pixels)
     return SparsePoints(
-        rig.names,
-        np.concatenate([part.xyz for part in parts]),
-        srgb_from_linear(medians(tint, whole.point)),
-        whole.views,
-        np.sqrt(np.add.reduceat(errors**2, whole.starts) / whole.views).astype(np.float32),
-        np.repeat(np.arange(len(parts)), counts).astype(np.int32),
-        whole.point,
-        whole.camera,
-        _undistorted_all(rig, whole),
-        np.concatenate([part.light for part in parts]),
-        matches_report(rig, evidence, errors_px=errors, options=options.judge),
+        cameras=rig.names,
+        xyz=np.concatenate([part.xyz for part in parts]),
+        rgb=srgb_from_linear(medians(tint, whole.point)),
+        views=whole.views,
+        error_px=np.sqrt(np.add.reduceat(errors**2, whole.starts) / whole.views).astype(np.float32),
+        instant=np.repeat(np.arange(len(parts)), counts).astype(np.int32),
+        point=whole.point,
+        camera=whole.camera,
+        xy=_undistorted_all(rig, whole),
+        colour=np.concatenate([part.light for part in parts]),
+        matches=matches_report(rig, evidence, errors_px=errors, options=options.judge),
     )
 
 
