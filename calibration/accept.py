@@ -117,7 +117,8 @@ def _centre_ahead(centres: np.ndarray, forwards: np.ndarray, points: np.ndarray 
         depth = float(np.median((points - middle) @ ahead))
     else:
         depth = 3 * float(np.linalg.norm(centres.max(axis=0) - centres.min(axis=0)))
-    return middle + depth * ahead
+    centre: np.ndarray = middle + depth * ahead
+    return centre
 
 
 def _common_radius(rig: Rig, centre: np.ndarray, radius: float, options: CheckOptions) -> float:
@@ -273,9 +274,16 @@ def matches_report(
     explained = float((every <= options.max_error_px).mean()) if len(every) else None
     verdict, reason = _verdict(explained, len(telling), len(rig.cameras), options)
     return MatchesReport(
-        len(telling), len(every), explained, _median([float(np.median(error)) for error in errors]), bad,
-        _bad_cameras(telling, shares, options.bad_share), _median(errors_px), verdict, reason,
-    )  # fmt: skip
+        pairs=len(telling),
+        matches=len(every),
+        explained_share=explained,
+        pair_median_px=_median([float(np.median(error)) for error in errors]),
+        bad_pairs=bad,
+        bad_cameras=_bad_cameras(telling, shares, options.bad_share),
+        reprojection_px=_median(errors_px),
+        verdict=verdict,
+        reason=reason,
+    )
 
 
 def _merged(matches: Sequence[PairMatches]) -> list[PairMatches]:
@@ -284,10 +292,14 @@ def _merged(matches: Sequence[PairMatches]) -> list[PairMatches]:
     for pair in matches:
         groups.setdefault(pair.key, []).append(pair)
     return [
-        PairMatches(group[0].first, group[0].second, np.concatenate([pair.first_pixels for pair in group]),
-                    np.concatenate([pair.second_pixels for pair in group]))
+        PairMatches(
+            group[0].first,
+            group[0].second,
+            np.concatenate([pair.first_pixels for pair in group]),
+            np.concatenate([pair.second_pixels for pair in group]),
+        )
         for group in groups.values()
-    ]  # fmt: skip
+    ]
 
 
 def _median(values: Sequence[float] | np.ndarray | None) -> float | None:

@@ -83,10 +83,15 @@ def balance(points: SparsePoints, *, options: BalanceOptions = BalanceOptions())
     log_gains = _log_gains(data.only(used), cameras, options) if kept else np.zeros((cameras, 3))
     names = points.cameras
     return ColourReport(
-        {name: _triple(np.exp(row)) for name, row in zip(names, log_gains, strict=True)}, kept, reason, before, after,
-        len(np.unique(data.point)), dict(zip(names, counts.tolist(), strict=True)),
-        tuple(name for name, enough in zip(names, strong, strict=True) if not enough),
-    )  # fmt: skip
+        gains={name: _triple(np.exp(row)) for name, row in zip(names, log_gains, strict=True)},
+        kept=kept,
+        reason=reason,
+        spread_before=before,
+        spread_after=after,
+        points=len(np.unique(data.point)),
+        observations=dict(zip(names, counts.tolist(), strict=True)),
+        weak_cameras=tuple(name for name, enough in zip(names, strong, strict=True) if not enough),
+    )
 
 
 def with_gains(rig: Rig, report: ColourReport) -> Rig:
@@ -155,7 +160,9 @@ def _channel(data: _Light, log: np.ndarray, cameras: int, options: BalanceOption
 
 
 @njit(cache=True, error_model="numpy")
-def _normal_equations(row, camera, log, weight, cameras):  # type: ignore[no-untyped-def]
+def _normal_equations(
+    row: np.ndarray, camera: np.ndarray, log: np.ndarray, weight: np.ndarray, cameras: int
+) -> tuple[np.ndarray, np.ndarray]:
     """[C, C] and [C] of the gains alone, the points' colours eliminated; `row` int64 [M] is sorted, without gaps."""
     matrix, vector = np.zeros((cameras, cameras)), np.zeros(cameras)
     start = 0

@@ -94,9 +94,16 @@ def _transforms_frame(camera: Camera) -> dict[str, Any]:
     pose = np.linalg.inv(camera.camera_from_world) @ _OPENCV_FROM_OPENGL
     lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False))
     return {
-        "file_path": f"images/{camera.name}.png", "w": camera.width, "h": camera.height, "fl_x": camera.fx,
-        "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, **lens, "transform_matrix": pose.tolist(),
-    }  # fmt: skip
+        "file_path": f"images/{camera.name}.png",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        **lens,
+        "transform_matrix": pose.tolist(),
+    }
 
 
 def _llff_pose(camera: Camera) -> np.ndarray:

@@ -129,7 +129,8 @@ def pairs_by_look(
 
 def _rooted(histograms: np.ndarray) -> np.ndarray:
     sums = np.maximum(histograms.sum(axis=1, keepdims=True), 1e-9)
-    return np.rint(np.sqrt(histograms / sums) * _LENGTH).astype(np.int16)
+    rooted: np.ndarray = np.rint(np.sqrt(histograms / sums) * _LENGTH).astype(np.int16)
+    return rooted
 
 
 def _open_band(first: int, second: int) -> Band:
@@ -137,7 +138,14 @@ def _open_band(first: int, second: int) -> Band:
 
 
 @njit(cache=True, error_model="numpy")
-def _rivals(first, second, lines, rays, first_reach, second_reach):  # type: ignore[no-untyped-def]
+def _rivals(
+    first: np.ndarray,
+    second: np.ndarray,
+    lines: np.ndarray,
+    rays: np.ndarray,
+    first_reach: np.ndarray,
+    second_reach: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """For each feature: index of its nearest in the other picture (-1 for none), squared distances of the two nearest.
 
     Returns int32 [N, 3] and [M, 3]. A tie goes to the lower index. Descriptors have about the same norm, but their

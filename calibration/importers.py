@@ -23,16 +23,23 @@ import numpy as np
 
 from calibration.rig import Camera, Rig
 
-_PICTURE_SUFFIXES = {
-    ".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".mp4", ".mov", ".mkv", ".avi", ".webm", ".mxf",
-}  # fmt: skip
+_PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".exr"}
+_VIDEO_SUFFIXES = {".mp4", ".mov", ".mkv", ".avi", ".webm", ".mxf"}
 _NAMES_SHOWN = 8
 # COLMAP's model number: name and count of parameters (src/colmap/sensor/models.h).
 _MODELS = {
-    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
-}  # fmt: skip
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
 _PARAMETER_COUNTS = dict(_MODELS.values())
 _NERFSTUDIO_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -185,7 +192,7 @@ def _agree(group: Sequence[Camera], size: float) -> bool:
 def _picture_names(path: str) -> tuple[str, str]:
     """Names that a picture's file may give its camera: the file's own, or its folder's."""
     picture = PurePosixPath(path.replace("\\", "/"))
-    own = picture.stem if picture.suffix.lower() in _PICTURE_SUFFIXES else picture.name
+    own = picture.stem if picture.suffix.lower() in _PICTURE_SUFFIXES | _VIDEO_SUFFIXES else picture.name
     return own, picture.parent.name
 
 
@@ -204,8 +211,10 @@ def _pose(rotation: np.ndarray, translation: np.ndarray, what: str) -> np.ndarra
     """Rigid [4, 4] from a rotation that text has rounded; raises ValueError when it is none."""
     left, scales, right = np.linalg.svd(rotation)
     if not np.allclose(scales, 1, atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise ValueError(f"{what}: the pose must hold a rotation, but its axes have lengths {np.round(scales, 4)} "
-                         f"and determinant {np.linalg.det(rotation):.4f}")  # fmt: skip
+        raise ValueError(
+            f"{what}: the pose must hold a rotation, but its axes have lengths {np.round(scales, 4)} "
+            f"and determinant {np.linalg.det(rotation):.4f}"
+        )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = left @ right, np.asarray(translation, dtype=np.float64)
     return pose
@@ -367,10 +376,16 @@ def _caliscope_view(table: Mapping[str, Any]) -> _View:
     rotation = turn if turn.shape == (3, 3) else cv2.Rodrigues(turn)[0]
     # OpenCV calibrates with the top-left pixel's centre at (0, 0), half a pixel from ours.
     camera = Camera(
-        "", int(width), int(height), float(matrix[0, 0]), float(matrix[1, 1]),
-        float(matrix[0, 2]) + 0.5, float(matrix[1, 2]) + 0.5,
-        _pose(rotation, table["translation"], f"camera {number}"), _lens(np.ravel(table["distortions"])),
-    )  # fmt: skip
+        name="",
+        width=int(width),
+        height=int(height),
+        fx=float(matrix[0, 0]),
+        fy=float(matrix[1, 1]),
+        cx=float(matrix[0, 2]) + 0.5,
+        cy=float(matrix[1, 2]) + 0.5,
+        camera_from_world=_pose(rotation, table["translation"], f"camera {number}"),
+        distortion=_lens(np.ravel(table["distortions"])),
+    )
     return _View((f"cam_{number}", f"port_{number}", f"cam{number}", str(number)), camera)
 
 
@@ -451,9 +466,16 @@ def _easymocap_view(name: str, lenses: cv2.FileStorage, poses: cv2.FileStorage) 
         raise ValueError(f"intri.yml must give camera {name!r} its picture size, as H_{name}: 1080 and W_{name}: 1920")
     # OpenCV calibrates with the top-left pixel's centre at (0, 0), half a pixel from ours.
     camera = Camera(
-        "", round(width), round(height), matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5,
-        _pose(rotation, shift[:, 0], f"camera {name!r}"), _lens(() if lens is None else np.ravel(lens)),
-    )  # fmt: skip
+        name="",
+        width=round(width),
+        height=round(height),
+        fx=matrix[0, 0],
+        fy=matrix[1, 1],
+        cx=matrix[0, 2] + 0.5,
+        cy=matrix[1, 2] + 0.5,
+        camera_from_world=_pose(rotation, shift[:, 0], f"camera {name!r}"),
+        distortion=_lens(() if lens is None else np.ravel(lens)),
+    )
     return _View((name,), camera)
 
 

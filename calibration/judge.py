@@ -89,9 +89,12 @@ def _reread_pose(pose: np.ndarray, reading: Reading) -> np.ndarray:
         return turned
     inverse = np.eye(4)
     inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-    return {Reading.INVERTED: inverse, Reading.OPENGL: _OPENGL @ pose, Reading.INVERTED_OPENGL: _OPENGL @ inverse}[
-        reading
-    ]
+    poses: dict[Reading, np.ndarray] = {
+        Reading.INVERTED: inverse,
+        Reading.OPENGL: _OPENGL @ pose,
+        Reading.INVERTED_OPENGL: _OPENGL @ inverse,
+    }
+    return poses[reading]
 
 
 def _report(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> MatchesReport | None:

@@ -80,7 +80,8 @@ class _Geometry:
             push = _sums(weight[:, None] * np.einsum("mij,mi->mj", slope, residual), sightings)
             damping = 1e-9 * np.trace(normal, axis1=1, axis2=2) + 1e-12
             unit = unit - np.linalg.solve(normal + damping[:, None, None] * np.eye(3), push[:, :, None])[:, :, 0]
-        return unit * self._size + self._middle
+        points: np.ndarray = unit * self._size + self._middle
+        return points
 
     def errors_px(self, sightings: Sightings, xyz: np.ndarray) -> np.ndarray:
         """Distance in the undistorted picture, infinite behind the camera: float64 [M]."""
@@ -147,7 +148,8 @@ def essential(first: Camera, second: Camera) -> np.ndarray:
     """E with b^T E a = 0 for the two cameras' coordinates at z = 1, float64 [3, 3]."""
     second_from_first = second.camera_from_world @ np.linalg.inv(first.camera_from_world)
     x, y, z = second_from_first[:3, 3]
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ second_from_first[:3, :3]
+    matrix: np.ndarray = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ second_from_first[:3, :3]
+    return matrix
 
 
 def sampson_px(first: Camera, second: Camera, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -157,7 +159,8 @@ def sampson_px(first: Camera, second: Camera, a: np.ndarray, b: np.ndarray) -> n
     lines_a = np.hstack([b, one]) @ essential(first, second)
     residual = (np.hstack([b, one]) * lines_b).sum(axis=1)
     slope = (lines_a[:, :2] / (first.fx, first.fy)) ** 2 + (lines_b[:, :2] / (second.fx, second.fy)) ** 2
-    return np.abs(residual) / np.sqrt(np.maximum(slope.sum(axis=1), 1e-30))
+    distance: np.ndarray = np.abs(residual) / np.sqrt(np.maximum(slope.sum(axis=1), 1e-30))
+    return distance
 
 
 def in_front(first: Camera, second: Camera, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -169,4 +172,5 @@ def in_front(first: Camera, second: Camera, a: np.ndarray, b: np.ndarray) -> np.
     uu, vv, uv = (u * u).sum(1), (v * v).sum(1), (u * v).sum(1)
     depth_a = vv * (u @ base) - uv * (v @ base)
     depth_b = uv * (u @ base) - uu * (v @ base)
-    return (depth_a > 0) & (depth_b > 0)
+    ahead: np.ndarray = (depth_a > 0) & (depth_b > 0)
+    return ahead

@@ -59,7 +59,8 @@ class Camera:
     @property
     def centre(self) -> np.ndarray:
         """Where the camera stands, world, float64 [3]."""
-        return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+        centre: np.ndarray = -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+        return centre
 
     @property
     def forward(self) -> np.ndarray:
@@ -98,17 +99,19 @@ class Camera:
     def sees(self, points: np.ndarray) -> np.ndarray:
         """Which world points [N, 3] lie before the camera and inside its picture, bool [N]."""
         pixels, depth = self.project(points)
-        inside = np.all((pixels >= 0) & (pixels <= (self.width, self.height)), axis=1) & (depth > 0)
+        inside: np.ndarray = np.all((pixels >= 0) & (pixels <= (self.width, self.height)), axis=1) & (depth > 0)
         if not self.distortion:
             return inside
         # A lens polynomial that folds back maps rays far outside the field of view into the picture.
         local = self._local(points)
         corners = self.plane_from_pixels(np.array([(x, y) for x in (0, self.width) for y in (0, self.height)]))
         reach = 1.05 * np.linalg.norm(corners, axis=1).max()
-        return inside & (np.linalg.norm(local[:, :2], axis=1) <= reach * np.maximum(depth, 0))
+        inside &= np.linalg.norm(local[:, :2], axis=1) <= reach * np.maximum(depth, 0)
+        return inside
 
     def _local(self, points: np.ndarray) -> np.ndarray:
-        return points @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]  # [N, 3], camera axes
+        local: np.ndarray = points @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
+        return local  # [N, 3], camera axes
 
 
 @dataclass(frozen=True)
@@ -202,6 +205,14 @@ def _camera_from_json(item: Mapping[str, Any]) -> Camera:
     if unknown:
         raise ValueError(f"camera {item.get('name')!r} has the unknown fields {unknown}")
     return Camera(
-        item["name"], item["width"], item["height"], item["fx"], item["fy"], item["cx"], item["cy"],
-        np.asarray(item["camera_from_world"], dtype=np.float64), tuple(item["distortion"]), tuple(item["gains"]),
-    )  # fmt: skip
+        name=item["name"],
+        width=item["width"],
+        height=item["height"],
+        fx=item["fx"],
+        fy=item["fy"],
+        cx=item["cx"],
+        cy=item["cy"],
+        camera_from_world=np.asarray(item["camera_from_world"], dtype=np.float64),
+        distortion=tuple(item["distortion"]),
+        gains=tuple(item["gains"]),
+    )

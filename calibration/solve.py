@@ -102,8 +102,10 @@ def _instants(pictures: Mapping[str, np.ndarray | Sequence[np.ndarray]]) -> dict
         raise ValueError(f"a solve needs two cameras or more with the same number of instants each, but got {counts}")
     for name, shots in listed.items():
         if any(shot.dtype != np.uint8 or shot.ndim != 3 or shot.shape != shots[0].shape for shot in shots):
-            raise ValueError(f"camera {name!r} needs uint8 pictures [H, W, 3] of one size, "
-                             f"but got {[(str(shot.dtype), shot.shape) for shot in shots]}")  # fmt: skip
+            raise ValueError(
+                f"camera {name!r} needs uint8 pictures [H, W, 3] of one size, "
+                f"but got {[(str(shot.dtype), shot.shape) for shot in shots]}"
+            )
     return listed
 
 

@@ -19,12 +19,8 @@ from calibration.accept import CheckOptions, MatchesReport, MatchOptions, PairMa
 from calibration.features import Band, FeatureOptions, Features, detect, match
 from calibration.multiview import Sightings, essential, locate, medians
 from calibration.rig import Camera, Rig
+from calibration.srgb import LINEAR, srgb_from_linear
 from calibration.tracks import Link, chain
-
-_LINEAR = np.array(
-    [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.arange(256) / 255], dtype=np.float32
-)
-"""sRGB's electro-optical transfer function for 8-bit values: uint8 to linear light in [0, 1]"""
 
 _COARSE = CheckOptions(samples=21)
 """Pairs need the scene's centre, not the exact extent of what the cameras share"""
@@ -208,9 +204,11 @@ def _epipolar_band(first: Camera, second: Camera, a: Features, b: Features, limi
     matrix = essential(first, second)
     lines_b, lines_a = rays_a @ matrix.T, rays_b @ matrix  # [N, 3] in second, [M, 3] in first
     return Band(
-        lines_b, rays_b, limit_px * np.linalg.norm(lines_b[:, :2] / (second.fx, second.fy), axis=1),
+        lines_b,
+        rays_b,
+        limit_px * np.linalg.norm(lines_b[:, :2] / (second.fx, second.fy), axis=1),
         limit_px * np.linalg.norm(lines_a[:, :2] / (first.fx, first.fy), axis=1),
-    )  # fmt: skip
+    )
 
 
 def _rays(camera: Camera, features: Features) -> np.ndarray:
@@ -256,9 +254,12 @@ def _part(
     options: TriangulateOptions,
 ) -> _Part:
     sightings, xyz, errors = locate(
-        rig, _sightings(rig, features, pairs, options), max_error_px=options.max_error_px,
-        min_views=options.min_views, min_angle_deg=options.min_angle_deg,
-    )  # fmt: skip
+        rig,
+        _sightings(rig, features, pairs, options),
+        max_error_px=options.max_error_px,
+        min_views=options.min_views,
+        min_angle_deg=options.min_angle_deg,
+    )
     light, tint = np.zeros((2, len(errors), 3), np.float32)
     for index, name in enumerate(rig.names):
         mine = sightings.camera == index
@@ -275,7 +276,7 @@ def patch_light(picture: np.ndarray, pixels: np.ndarray, *, side_px: int) -> tup
     `picture` is uint8 RGB. Values below 4 or above 250 count as clipped: what they hide would bend a gain.
     """
     size = (side_px, side_px)
-    mean = cv2.blur(_LINEAR[picture], size, borderType=cv2.BORDER_REPLICATE)
+    mean = cv2.blur(LINEAR[picture], size, borderType=cv2.BORDER_REPLICATE)
     clipped = ((picture < 4) | (picture > 250)).any(axis=2)
     spread = cv2.blur(np.asarray(clipped, dtype=np.float32), size, borderType=cv2.BORDER_REPLICATE)
     column = np.clip(pixels[:, 0].astype(int), 0, picture.shape[1] - 1)
@@ -300,12 +301,18 @@ def _joined(
     tint = np.concatenate([part.tint for part in parts])
     whole = Sightings(point.astype(np.int32), camera, pixels)
     return SparsePoints(
-        rig.names, np.concatenate([part.xyz for part in parts]), _srgb(medians(tint, whole.point)), whole.views,
-        np.sqrt(np.add.reduceat(errors**2, whole.starts) / whole.views).astype(np.float32),
-        np.repeat(np.arange(len(parts)), counts).astype(np.int32), whole.point, whole.camera,
-        _undistorted_all(rig, whole), np.concatenate([part.light for part in parts]),
-        matches_report(rig, evidence, errors_px=errors, options=options.judge),
-    )  # fmt: skip
+        cameras=rig.names,
+        xyz=np.concatenate([part.xyz for part in parts]),
+        rgb=srgb_from_linear(medians(tint, whole.point)),
+        views=whole.views,
+        error_px=np.sqrt(np.add.reduceat(errors**2, whole.starts) / whole.views).astype(np.float32),
+        instant=np.repeat(np.arange(len(parts)), counts).astype(np.int32),
+        point=whole.point,
+        camera=whole.camera,
+        xy=_undistorted_all(rig, whole),
+        colour=np.concatenate([part.light for part in parts]),
+        matches=matches_report(rig, evidence, errors_px=errors, options=options.judge),
+    )
 
 
 def _undistorted_all(rig: Rig, sightings: Sightings) -> np.ndarray:
@@ -314,9 +321,3 @@ def _undistorted_all(rig: Rig, sightings: Sightings) -> np.ndarray:
         mine = sightings.camera == index
         flat[mine] = _undistorted(camera, sightings.pixels[mine])
     return flat.astype(np.float32)
-
-
-def _srgb(light: np.ndarray) -> np.ndarray:
-    """Linear light in [0, 1] to 8-bit sRGB."""
-    curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.rint(np.clip(curved, 0, 1) * 255).astype(np.uint8)

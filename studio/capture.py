@@ -14,21 +14,19 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 
 from studio.clocks import EPOCH_NS, SECOND_NS, CameraTimes, ClockOptions, record, tick_times, timecode_lines
+from studio.film_set import FilmSet, build_set
 from studio.raycast import cast, follow, look_once, render
-from studio.rig import RigOptions, StudioCamera, place_cameras
-from studio.scene import Scene, build_scene
+from studio.rig import PlacementOptions, StudioCamera, place_cameras
+from studio.srgb import srgb_from_linear
 from studio.truth import PixelTruthWriter, Recording, truth_json
 from studio.video import VideoWriter
 
 LATEST_ENTRANCE_S = 6.0
 """In a long capture the visitor does not keep one waiting longer than this"""
 LARGEST_SIDE = 8192
-
-Progress = Callable[[int, int], None]
 
 
 class TruthKind(StrEnum):
@@ -79,7 +77,7 @@ class SimulateOptions:
     """Decides colours and details of the room, the rig's irregularities, clocks and gains"""
     samples: int = 2
     """Rays per pixel along each axis: 2 means 4 rays"""
-    rig: RigOptions = field(default_factory=RigOptions)
+    rig: PlacementOptions = field(default_factory=PlacementOptions)
     clock: ClockOptions = field(default_factory=ClockOptions)
     colour: ColourOptions = field(default_factory=ColourOptions)
     entrance_share: float = 0.3
@@ -135,7 +133,9 @@ class SimulateOptions:
             )
 
 
-def simulate(folder: Path, options: SimulateOptions | None = None, progress: Progress | None = None) -> None:
+def simulate(
+    folder: Path, options: SimulateOptions | None = None, progress: Callable[[int, int], None] | None = None
+) -> None:
     """Write a capture folder with videos, timecodes, calibration and truth.
 
     The folder appears complete or not at all: it is written beside its place and renamed.
@@ -169,10 +169,13 @@ def draw_gains(cameras: int, seed: int, options: ColourOptions) -> np.ndarray:
     exposure = rng.uniform(-1, 1, (cameras, 1)) * np.log1p(options.exposure_spread)
     balance = rng.uniform(-1, 1, (cameras, 3)) * np.log1p(options.white_balance_spread)
     log = exposure + balance
-    return np.exp(log - log.mean(axis=0))
+    gains: np.ndarray = np.exp(log - log.mean(axis=0))
+    return gains
 
 
-def _write(folder: Path, times: tuple[CameraTimes, ...], options: SimulateOptions, progress: Progress | None) -> None:
+def _write(
+    folder: Path, times: tuple[CameraTimes, ...], options: SimulateOptions, progress: Callable[[int, int], None] | None
+) -> None:
     digits = max(2, len(str(options.cameras)))
     names = [f"cam{number + 1:0{digits}d}" for number in range(options.cameras)]
     rig = place_cameras(names, options.width, options.height, options.seed, options.rig)
@@ -197,23 +200,23 @@ def _film_all(
     entrance_s: float,
     recordings: Sequence[Recording],
     options: SimulateOptions,
-    progress: Progress | None,
+    progress: Callable[[int, int], None] | None,
 ) -> None:
     report = progress or (lambda done, total: None)
     done, total = 0, sum(len(recording.times.ticks) for recording in recordings)
     report(done, total)
-    scene = build_scene(options.seed, entrance_s)
+    film_set = build_set(options.seed, entrance_s)
     for recording in recordings:
-        for _ in _film(folder, scene, recording, options):
+        for _ in _film(folder, film_set, recording, options):
             done += 1
             report(done, total)
 
 
-def _film(folder: Path, scene: Scene, recording: Recording, options: SimulateOptions) -> Iterator[None]:
+def _film(folder: Path, film_set: FilmSet, recording: Recording, options: SimulateOptions) -> Iterator[None]:
     """Film one camera's frames, yielding after each."""
     camera, times, gains = recording
     view = camera.view
-    backdrop = look_once(view, scene.standing, scene.light, scene.colours, samples=options.samples)
+    backdrop = look_once(view, film_set.standing, film_set.light, film_set.colours, samples=options.samples)
     with ExitStack() as stack:
         video = stack.enter_context(
             VideoWriter(folder / "videos" / f"{camera.name}.mp4", camera.width, camera.height, options.fps)
@@ -223,14 +226,16 @@ def _film(folder: Path, scene: Scene, recording: Recording, options: SimulateOpt
             truth = stack.enter_context(
                 PixelTruthWriter(folder / "truth" / f"{camera.name}.npz", backdrop.centre_depth)
             )
-        moment = scene.at(_seconds(times.times_ns[0]))
+        moment = film_set.at(_seconds(times.times_ns[0]))
         for next_ns in times.next_times_ns:
-            light = render(view, backdrop, scene.standing, moment.movers, moment.blockers, scene.light, scene.colours)
+            light = render(
+                view, backdrop, film_set.standing, moment.movers, moment.blockers, film_set.light, film_set.colours
+            )
             video.write(srgb_picture(light, gains))
-            later = scene.at(_seconds(next_ns))
+            later = film_set.at(_seconds(next_ns))
             if truth is not None:
                 hits = cast(view, backdrop, moment.movers)
-                truth.write(hits, follow(view, hits, scene.standing, moment.movers, later.movers))
+                truth.write(hits, follow(view, hits, film_set.standing, moment.movers, later.movers))
             moment = later
             yield
 
@@ -241,22 +246,7 @@ def _seconds(time_ns: np.int64) -> float:
 
 def srgb_picture(light: np.ndarray, gains: np.ndarray) -> np.ndarray:
     """What a camera records of linear light: gains, clipping at 1, sRGB, float32 [H, W, 3] to uint8 [H, W, 3]."""
-    picture = np.empty(light.shape, np.uint8)
-    _to_srgb(light, gains, picture)
-    return picture
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _to_srgb(light, gains, picture):
-    for row in range(light.shape[0]):
-        for column in range(light.shape[1]):
-            for channel in range(3):
-                value = min(max(light[row, column, channel] * gains[channel], 0.0), 1.0)
-                if value <= 0.0031308:
-                    coded = 12.92 * value
-                else:
-                    coded = 1.055 * value ** (1 / 2.4) - 0.055
-                picture[row, column, channel] = int(255 * coded + 0.5)
+    return (255 * srgb_from_linear(np.clip(light * gains, 0, 1)) + 0.5).astype(np.uint8)
 
 
 def _write_settings(path: Path, names: list[str], options: SimulateOptions) -> None:

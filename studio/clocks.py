@@ -138,5 +138,5 @@ def _record_one(late: int, frames: int, fps: Fraction, rng: np.random.Generator,
 def _stamps(times_ns: np.ndarray, offset_ns: int, drift_ppm: float, noise_ns: np.ndarray) -> np.ndarray:
     """What the camera's clock shows, rounded to microseconds, int64; only small differences pass through float."""
     error = offset_ns + (times_ns - EPOCH_NS).astype(np.float64) * (drift_ppm * 1e-6) + noise_ns
-    stamps = times_ns + np.rint(error).astype(np.int64)
+    stamps: np.ndarray = times_ns + np.rint(error).astype(np.int64)
     return (stamps + 500) // 1000 * 1000

@@ -77,7 +77,8 @@ def add_figure(parts: Parts, owner: int, clothes: Clothes, pose: Pose) -> np.nda
     trunk = body.world(np.array([0.0, 0.0, body.hips + 0.2]))
     hips = body.world(np.array([0.0, 0.0, body.hips - 0.1]))
     rows = [(*foot, 0.10) for foot in feet] + [(*hips, 0.17), (*trunk, 0.18)]
-    return np.array(rows) * np.array([1, 1, 1, clothes.height])
+    balls: np.ndarray = np.array(rows) * np.array([1, 1, 1, clothes.height])
+    return balls
 
 
 class _Body:
@@ -92,7 +93,8 @@ class _Body:
         self.twist = 0.16 * pose.gait * np.sin(pose.phase_rad)
 
     def world(self, point: np.ndarray) -> np.ndarray:
-        return np.array([*self.pose.place, 0.0]) + self.clothes.height * (point @ self.turn.T)
+        place: np.ndarray = np.array([*self.pose.place, 0.0]) + self.clothes.height * (point @ self.turn.T)
+        return place
 
     def add_leg(self, side: int) -> np.ndarray:
         """Thigh, shin and shoe; returns the shoe's middle in the world."""
@@ -195,4 +197,5 @@ class _Body:
 
 
 def _towards(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
-    return first + share * (second - first)
+    between: np.ndarray = first + share * (second - first)
+    return between

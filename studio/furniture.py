@@ -74,7 +74,8 @@ def _slab(parts: Parts, owner: int, low: Point, high: Point, look: Look) -> None
 
 
 def _above(point: np.ndarray, height: float) -> np.ndarray:
-    return point + np.array([0.0, 0.0, height])
+    raised: np.ndarray = point + np.array([0.0, 0.0, height])
+    return raised
 
 
 def _board(parts: Parts, owner: int, texture: str, centre: Point, wide: float, high: float, wall: str) -> None:
@@ -134,7 +135,8 @@ def _add_table(parts: Parts, furniture: int, things: int, vase: int) -> None:
     turn, middle = turn_about_z(0.45), np.array([-1.35, 0.95, 0.0])
 
     def at(x: float, y: float, z: float) -> np.ndarray:
-        return middle + turn @ np.array([x, y, z])
+        place: np.ndarray = middle + turn @ np.array([x, y, z])
+        return place
 
     parts.box(furniture, at(0, 0, 0.72), np.array([0.62, 0.38, 0.02]), Look("wood_light", (0.9, 0.9)), turn)
     parts.box(furniture, at(0, 0, 0.66), np.array([0.56, 0.32, 0.04]), Look("wood_dark", (0.9, 4.0)), turn)
@@ -169,7 +171,10 @@ def _lathe(foot: np.ndarray) -> np.ndarray:
     angle = np.linspace(0, 2 * np.pi, 23)
     rim = np.stack([radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)], axis=2)
     rim[:, -1] = rim[:, 0]
-    return foot + np.concatenate([rim, np.broadcast_to(0.36 * height[:, None, None], (18, 23, 1))], axis=2)
+    points: np.ndarray = foot + np.concatenate(
+        [rim, np.broadcast_to(0.36 * height[:, None, None], (18, 23, 1))], axis=2
+    )
+    return points
 
 
 def _add_bookshelf(parts: Parts, furniture: int, things: int, rng: np.random.Generator) -> None:

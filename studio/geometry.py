@@ -1,4 +1,4 @@
-"""Shapes in the room as flat arrays that compiled code reads, and the tree over their bounds.
+"""Shapes in the room as flat arrays that compiled code reads.
 
 A shape is a solid with a canonical form and an affine matrix to the world, or a triangle of a mesh. A point of its
 surface keeps its canonical coordinates (its weights, for a triangle) while the shape moves, bends or breathes: that is
@@ -10,15 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from studio.raycast import BOX, CONE, CYLINDER, ELLIPSOID, Shapes
+from studio.raycast import BOX, CONE, CYLINDER, ELLIPSOID, Shapes, item_bounds, tree_over
 from studio.textures import Textures
-
-LEAF = 2
-"""Items that a leaf of the tree may hold"""
-BINS = 8
 
 
 @dataclass(frozen=True)
@@ -136,7 +131,7 @@ class Parts:
             ),
             np.concatenate([self._owners, np.repeat([mesh.owner for mesh in self._meshes], faces)]).astype(np.uint8),
             np.array(self._looks, dtype=np.float64).reshape(-1, 11),
-            *_build(*item_bounds(kind, matrix, size, vertices, triangles)),
+            *tree_over(*item_bounds(kind, matrix, size, vertices, triangles)),
         )
 
     def _add(
@@ -211,120 +206,3 @@ def _grid_mesh(points: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray
     second = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=1)
     faces = np.concatenate([first, second]).astype(np.int32)
     return points.reshape(-1, 3), normal.reshape(-1, 3), np.stack([u, v], axis=2).reshape(-1, 2), faces
-
-
-# The tree
-
-
-@numba.njit(cache=True, error_model="numpy")
-def item_bounds(kind, matrix, size, vertices, triangles):
-    """Bounds of all items, lower and upper, float64 [P + F, 3]."""
-    solids = len(kind)
-    total = solids + len(triangles)
-    lower, upper = np.empty((total, 3)), np.empty((total, 3))
-    for item in range(solids):
-        m, form = matrix[item], kind[item]
-        for axis in range(3):
-            centre = m[axis, 3]
-            if form == BOX:
-                reach = abs(m[axis, 0]) + abs(m[axis, 1]) + abs(m[axis, 2])
-            elif form == ELLIPSOID:
-                reach = np.sqrt(m[axis, 0] ** 2 + m[axis, 1] ** 2 + m[axis, 2] ** 2)
-            elif form == CYLINDER:
-                reach = np.sqrt(m[axis, 0] ** 2 + m[axis, 1] ** 2) + abs(m[axis, 2])
-            if form == CONE:
-                end = centre + m[axis, 2] * size[item, 2]
-                lower[item, axis] = min(centre - size[item, 0], end - size[item, 1])
-                upper[item, axis] = max(centre + size[item, 0], end + size[item, 1])
-            else:
-                lower[item, axis] = centre - reach
-                upper[item, axis] = centre + reach
-    for face in range(len(triangles)):
-        a, b, c = triangles[face]
-        for axis in range(3):
-            x, y, z = vertices[a, axis], vertices[b, axis], vertices[c, axis]
-            lower[solids + face, axis] = min(x, y, z)
-            upper[solids + face, axis] = max(x, y, z)
-    return lower, upper
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _build(lower, upper):
-    total = len(lower)
-    order = np.arange(total).astype(np.int32)
-    box_lower, box_upper = np.empty((2 * total, 3)), np.empty((2 * total, 3))
-    first, count = np.zeros(2 * total, np.int32), np.zeros(2 * total, np.int32)
-    bins, filled = np.empty((BINS, 6)), np.empty(BINS, np.int64)
-    first[0], count[0] = 0, total
-    nodes, node = 1, 0
-    # children come after their parents, so one pass over the growing list visits every node
-    while node < nodes:
-        start, stop = first[node], first[node] + count[node]
-        box_lower[node], box_upper[node] = np.inf, -np.inf
-        for place in range(start, stop):
-            for axis in range(3):
-                box_lower[node, axis] = min(box_lower[node, axis], lower[order[place], axis])
-                box_upper[node, axis] = max(box_upper[node, axis], upper[order[place], axis])
-        if stop - start > LEAF:
-            middle = _split(lower, upper, order, start, stop, bins, filled)
-            first[nodes], count[nodes] = start, middle - start
-            first[nodes + 1], count[nodes + 1] = middle, stop - middle
-            first[node], count[node] = nodes, 0
-            nodes += 2
-        node += 1
-    return box_lower[:nodes].copy(), box_upper[:nodes].copy(), first[:nodes].copy(), count[:nodes].copy(), order
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _split(lower, upper, order, start, stop, bins, filled):
-    """Sort a range of items into two by the cheapest of the binned planes; returns where the second begins."""
-    best, best_axis, best_cut, best_low, best_scale = np.inf, -1, 0, 0.0, 0.0
-    for axis in range(3):
-        low, high = np.inf, -np.inf
-        for place in range(start, stop):
-            middle = lower[order[place], axis] + upper[order[place], axis]
-            low, high = min(low, middle), max(high, middle)
-        if high - low < 1e-9:
-            continue
-        scale = BINS * (1 - 1e-9) / (high - low)
-        _fill_bins(lower, upper, order, start, stop, axis, low, scale, bins, filled)
-        for cut in range(1, BINS):
-            cost = _half_cost(bins, filled, 0, cut) + _half_cost(bins, filled, cut, BINS)
-            if cost < best:
-                best, best_axis, best_cut, best_low, best_scale = cost, axis, cut, low, scale
-    if best_axis < 0:
-        return (start + stop) // 2
-    left, right = start, stop - 1
-    while left <= right:
-        item = order[left]
-        if int((lower[item, best_axis] + upper[item, best_axis] - best_low) * best_scale) < best_cut:
-            left += 1
-        else:
-            order[left], order[right] = order[right], item
-            right -= 1
-    return left
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _fill_bins(lower, upper, order, start, stop, axis, low, scale, bins, filled):
-    bins[:, :3], bins[:, 3:], filled[:] = np.inf, -np.inf, 0
-    for place in range(start, stop):
-        item = order[place]
-        cell = int((lower[item, axis] + upper[item, axis] - low) * scale)
-        filled[cell] += 1
-        for k in range(3):
-            bins[cell, k] = min(bins[cell, k], lower[item, k])
-            bins[cell, 3 + k] = max(bins[cell, 3 + k], upper[item, k])
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _half_cost(bins, filled, start, stop):
-    """Surface of the box about some bins times the number of items in them."""
-    items = 0
-    a, b, c, x, y, z = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
-    for cell in range(start, stop):
-        items += filled[cell]
-        a, b, c = min(a, bins[cell, 0]), min(b, bins[cell, 1]), min(c, bins[cell, 2])
-        x, y, z = max(x, bins[cell, 3]), max(y, bins[cell, 4]), max(z, bins[cell, 5])
-    x, y, z = x - a, y - b, z - c
-    return items * (x * y + y * z + z * x) if items > 0 else 0.0

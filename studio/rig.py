@@ -12,9 +12,9 @@ from enum import StrEnum
 
 import numpy as np
 
+from studio.film_set import VISITOR_FROM, VISITOR_TO, VISITOR_X
 from studio.furniture import HEIGHT
 from studio.raycast import View
-from studio.scene import VISITOR_FROM, VISITOR_TO, VISITOR_X
 
 TARGET = np.array([0.0, 0.0, 0.95])
 """What all cameras look at, world"""
@@ -38,7 +38,7 @@ class RigKind(StrEnum):
 
 
 @dataclass(frozen=True)
-class RigOptions:
+class PlacementOptions:
     """Where the cameras stand."""
 
     kind: RigKind = RigKind.RING
@@ -87,7 +87,8 @@ class StudioCamera:
     @property
     def centre(self) -> np.ndarray:
         """Where the camera stands, world, float64 [3]."""
-        return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+        centre: np.ndarray = -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+        return centre
 
     @property
     def view(self) -> View:
@@ -97,7 +98,7 @@ class StudioCamera:
 
 
 def place_cameras(
-    names: Sequence[str], width: int, height: int, seed: int, options: RigOptions
+    names: Sequence[str], width: int, height: int, seed: int, options: PlacementOptions
 ) -> tuple[StudioCamera, ...]:
     """Cameras by name, in order; the same seed gives the same rig."""
     rng = np.random.default_rng([seed, 3])
@@ -105,13 +106,13 @@ def place_cameras(
     return tuple(_camera(name, width, height, place, rng, options) for name, place in zip(names, places, strict=True))
 
 
-def _ring(count: int, options: RigOptions) -> np.ndarray:
+def _ring(count: int, options: PlacementOptions) -> np.ndarray:
     # half a step off, so that the doorway lies between two cameras of the usual rigs
     angle = 2 * np.pi * (np.arange(count) + 0.5) / count
     return _round(options.radius_m, angle, np.full(count, options.height_m or 2.15))
 
 
-def _dome(count: int, options: RigOptions) -> np.ndarray:
+def _dome(count: int, options: PlacementOptions) -> np.ndarray:
     """A golden spiral on a flattened dome, from low and wide to high and close."""
     share = (np.arange(count) + 0.5) / count
     radius = np.maximum(options.radius_m * np.cos(0.25 * np.pi * share), NEAREST_M)
@@ -120,13 +121,13 @@ def _dome(count: int, options: RigOptions) -> np.ndarray:
     return _round(radius, angle, 0.7 + (HIGHEST_M - 0.7) * share)[np.argsort(angle)]
 
 
-def _front(count: int, options: RigOptions) -> np.ndarray:
+def _front(count: int, options: PlacementOptions) -> np.ndarray:
     share = (np.arange(count) + 0.5) / count
     height = (options.height_m or 1.6) + 0.22 * np.where(np.arange(count) % 2, 1, -1)
     return _round(options.radius_m, -np.pi / 2 + np.radians(100) * (share - 0.5), height)
 
 
-PLACES: dict[RigKind, Callable[[int, RigOptions], np.ndarray]] = {
+PLACES: dict[RigKind, Callable[[int, PlacementOptions], np.ndarray]] = {
     RigKind.RING: _ring,
     RigKind.DOME: _dome,
     RigKind.FRONT: _front,
@@ -139,7 +140,7 @@ def _round(radius: float | np.ndarray, angle: np.ndarray, height: np.ndarray) ->
 
 
 def _camera(
-    name: str, width: int, height: int, place: np.ndarray, rng: np.random.Generator, options: RigOptions
+    name: str, width: int, height: int, place: np.ndarray, rng: np.random.Generator, options: PlacementOptions
 ) -> StudioCamera:
     shift, aim, lens = rng.normal(size=3), rng.normal(size=4), rng.normal(size=4)
     centre = _out_of_the_way(place + options.jitter_m * np.clip(shift, -2, 2))

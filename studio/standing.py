@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import numba
+from collections.abc import Callable
+
 import numpy as np
 
-from studio.geometry import item_bounds
-from studio.raycast import BOX, CYLINDER, ELLIPSOID, Shapes
+from studio.raycast import BOX, CONE, CYLINDER, ELLIPSOID, Shapes, item_bounds
 
 VOXEL_M = 0.07
 REACH_M = 0.6
 """Distances beyond this are of no interest and are stored as this"""
+
+Place = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Canonical coordinates of many points, arrays of one shape"""
 
 
 def clearance_of(shapes: Shapes, corner: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -22,41 +25,61 @@ def clearance_of(shapes: Shapes, corner: np.ndarray, shape: tuple[int, ...]) -> 
     """
     field = np.full(shape, REACH_M, np.float32)
     lower, upper = item_bounds(shapes.kind, shapes.matrix, shapes.size, shapes.vertices, shapes.triangles)
-    _carve(shapes.kind, shapes.inverse, shapes.size, corner, lower, upper, field)
+    for item, kind in enumerate(shapes.kind.tolist()):
+        first = np.maximum(((lower[item] - REACH_M - corner[:3]) / corner[3]).astype(int), 0)
+        stop = np.minimum(((upper[item] + REACH_M - corner[:3]) / corner[3]).astype(int) + 2, shape[::-1])
+        x, y, z = (corner[axis] + np.arange(first[axis], stop[axis]) * corner[3] for axis in range(3))
+        near = field[first[2] : stop[2], first[1] : stop[1], first[0] : stop[0]]
+        place = _canonical(shapes.inverse[item], x, y[:, None], z[:, None, None])
+        near[...] = np.minimum(near, np.maximum(DISTANCES[kind](place, shapes.size[item]), 0.0))
     return field
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _carve(kind, inverse, size, corner, lower, upper, field):
-    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    for item in range(len(kind)):
-        for axis in range(3):
-            cells = field.shape[2 - axis]
-            low[axis] = max(int((lower[item, axis] - REACH_M - corner[axis]) / corner[3]), 0)
-            high[axis] = min(int((upper[item, axis] + REACH_M - corner[axis]) / corner[3]) + 2, cells)
-        for k in range(low[2], high[2]):
-            for j in range(low[1], high[1]):
-                for i in range(low[0], high[0]):
-                    x, y, z = corner[0] + i * corner[3], corner[1] + j * corner[3], corner[2] + k * corner[3]
-                    field[k, j, i] = min(
-                        field[k, j, i], max(_distance(kind[item], inverse[item], size[item], x, y, z), 0.0)
-                    )
+def _canonical(
+    m: np.ndarray,  # [3, 4], canonical from world
+    x: np.ndarray,
+    y: np.ndarray,
+    z: np.ndarray,
+) -> Place:
+    a, b, c = (m[axis, 0] * x + m[axis, 1] * y + m[axis, 2] * z + m[axis, 3] for axis in range(3))
+    return a, b, c
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _distance(kind, m, size, px, py, pz):
-    """Distance from a point to a solid, metres; for an ellipsoid an estimate that is good near its surface."""
-    x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
-    y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
-    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
-    if kind == BOX:
-        a, b, c = (abs(x) - 1) * size[0], (abs(y) - 1) * size[1], (abs(z) - 1) * size[2]
-        outside = np.sqrt(max(a, 0.0) ** 2 + max(b, 0.0) ** 2 + max(c, 0.0) ** 2)
-        return outside + min(max(a, b, c), 0.0)
-    if kind == ELLIPSOID:
-        return (np.sqrt(x * x + y * y + z * z) - 1) * min(size[0], size[1], size[2])
-    if kind == CYLINDER:
-        a, c = (np.sqrt(x * x + y * y) - 1) * size[0], (abs(z) - 1) * size[2]
-        return np.sqrt(max(a, 0.0) ** 2 + max(c, 0.0) ** 2) + min(max(a, c), 0.0)
-    share = min(max(z / size[2], 0.0), 1.0)
-    return np.sqrt(x * x + y * y + (z - share * size[2]) ** 2) - (size[0] + share * (size[1] - size[0]))
+# Distances from points, in canonical coordinates, to solids, metres; negative inside.
+
+
+def _from_box(place: Place, size: np.ndarray) -> np.ndarray:
+    x, y, z = place
+    a, b, c = (np.abs(x) - 1) * size[0], (np.abs(y) - 1) * size[1], (np.abs(z) - 1) * size[2]
+    outside = np.sqrt(np.maximum(a, 0) ** 2 + np.maximum(b, 0) ** 2 + np.maximum(c, 0) ** 2)
+    distance: np.ndarray = outside + np.minimum(np.maximum(np.maximum(a, b), c), 0)
+    return distance
+
+
+def _from_ellipsoid(place: Place, size: np.ndarray) -> np.ndarray:
+    """An estimate that is good near the surface."""
+    x, y, z = place
+    distance: np.ndarray = (np.sqrt(x * x + y * y + z * z) - 1) * size.min()
+    return distance
+
+
+def _from_cylinder(place: Place, size: np.ndarray) -> np.ndarray:
+    x, y, z = place
+    a, c = (np.sqrt(x * x + y * y) - 1) * size[0], (np.abs(z) - 1) * size[2]
+    distance: np.ndarray = np.sqrt(np.maximum(a, 0) ** 2 + np.maximum(c, 0) ** 2) + np.minimum(np.maximum(a, c), 0)
+    return distance
+
+
+def _from_cone(place: Place, size: np.ndarray) -> np.ndarray:
+    x, y, z = place
+    share = np.clip(z / size[2], 0, 1)
+    distance: np.ndarray = np.sqrt(x * x + y * y + (z - share * size[2]) ** 2) - (size[0] + share * (size[1] - size[0]))
+    return distance
+
+
+DISTANCES: dict[int, Callable[[Place, np.ndarray], np.ndarray]] = {
+    BOX: _from_box,
+    ELLIPSOID: _from_ellipsoid,
+    CYLINDER: _from_cylinder,
+    CONE: _from_cone,
+}

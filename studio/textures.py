@@ -15,6 +15,8 @@ from itertools import repeat
 
 import numpy as np
 
+from studio.srgb import LINEAR, srgb_from_linear
+
 LEVELS = 12
 """Longest chain of halved copies that a texture may have: sides up to 2048"""
 
@@ -52,16 +54,6 @@ class Textures:
     """Row by name"""
 
 
-def srgb_from_linear(light: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] of linear light in [0, 1] (IEC 61966-2-1)."""
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-
-
-def linear_from_srgb(value: np.ndarray) -> np.ndarray:
-    """Linear light in [0, 1] of sRGB in [0, 1] (IEC 61966-2-1)."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
 def paint_textures(seed: int) -> Textures:
     """Paint all textures; each has a random stream of its own, so that adding one changes no other."""
     texels, starts, sizes = [], [], []
@@ -92,7 +84,7 @@ def _halvings(picture: np.ndarray) -> list[np.ndarray]:
     if height & (height - 1) or width & (width - 1):
         raise ValueError(f"a texture's sides must be powers of two, but are {width}x{height}")
     levels = [np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)]
-    light = linear_from_srgb(np.arange(256) / 255).astype(np.float32)[levels[0]]
+    light = LINEAR[levels[0]]
     while min(light.shape[:2]) > 1 and len(levels) < LEVELS:
         light = (light[::2, ::2] + light[1::2, ::2] + light[::2, 1::2] + light[1::2, 1::2]) / 4
         levels.append(np.rint(255 * srgb_from_linear(light)).astype(np.uint8))
@@ -137,7 +129,8 @@ def _grid(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
 def _mix(first: np.ndarray | Paint, second: np.ndarray | Paint, share: np.ndarray) -> np.ndarray:
     """From the first paint (share 0) to the second (share 1), float32 [H, W, 3]; share is [H, W]."""
     a, b = np.asarray(first, np.float32), np.asarray(second, np.float32)
-    return a + (b - a) * np.clip(share, 0, 1).astype(np.float32)[..., None]
+    mixed: np.ndarray = a + (b - a) * np.clip(share, 0, 1).astype(np.float32)[..., None]
+    return mixed
 
 
 def _plain(shape: tuple[int, int], paint: Paint) -> np.ndarray:
@@ -228,7 +221,7 @@ def _planks(rng: np.random.Generator, light: Paint, dark: Paint, boards: int, jo
     share = 0.15 + 0.6 * tone + 0.22 * grain + 0.10 * rings
     wood = _mix(light, dark, share)
     knots = _step(_noise(rng, shape, (4 * boards, 3 * joints)), 0.93, 0.08)
-    wood = _mix(wood, tuple(0.45 * part for part in dark), 0.7 * knots)  # type: ignore[arg-type]
+    wood = _mix(wood, 0.45 * np.array(dark), 0.7 * knots)
     gap = np.minimum(np.minimum(across, 1 - across), np.minimum(along % 1, 1 - along % 1) * boards / joints)
     return wood * (0.35 + 0.65 * _step(gap, 0.03, 0.03))[..., None]
 
@@ -256,7 +249,10 @@ def _panels(rng: np.random.Generator) -> np.ndarray:
     strokes = _clouds(rng, shape, (8, 96), 3, 0.7)
     paint = _mix((0.38, 0.47, 0.46), (0.47, 0.56, 0.53), 0.5 + 0.45 * strokes)
     scuffs = _step(_clouds(rng, shape, (24, 24), 3, 0.8), 0.62, 0.2)
-    return _mix(paint, (0.62, 0.62, 0.56), 0.5 * scuffs) * (1 - 0.45 * np.clip(groove + seam, 0, 1))[..., None]
+    panels: np.ndarray = (
+        _mix(paint, (0.62, 0.62, 0.56), 0.5 * scuffs) * (1 - 0.45 * np.clip(groove + seam, 0, 1))[..., None]
+    )
+    return panels
 
 
 def _plaster(rng: np.random.Generator, paint: Paint) -> np.ndarray:
@@ -331,7 +327,8 @@ def _rug(rng: np.random.Generator) -> np.ndarray:
     for inner, outer, choice in ((0.0, 0.02, 2), (0.055, 0.075, 0), (0.14, 0.175, 3)):
         wool = np.where(((edge >= inner) & (edge < outer))[..., None], wools[choice], wool)
     knots = _noise(rng, shape, (256, 256)) + 0.6 * np.sin(2 * np.pi * 256 * y)
-    return wool * (1 + 0.12 * knots + 0.10 * _clouds(rng, shape, (8, 8), 3))[..., None]
+    rug: np.ndarray = wool * (1 + 0.12 * knots + 0.10 * _clouds(rng, shape, (8, 8), 3))[..., None]
+    return rug
 
 
 def _marble(rng: np.random.Generator) -> np.ndarray:
@@ -573,7 +570,8 @@ def _banner(rng: np.random.Generator) -> np.ndarray:
     picture = _mix(picture, (0.92, 0.78, 0.30), crest < 0.08)
     _letters(picture, _word(rng, 7), 400, 44, 10, (0.10, 0.09, 0.14))
     cloth = 0.5 * np.sin(2 * np.pi * 128 * x) * np.sin(2 * np.pi * 128 * y) + _clouds(rng, shape, (16, 16), 4, 0.8)
-    return picture * (1 + 0.07 * cloth)[..., None]
+    woven: np.ndarray = picture * (1 + 0.07 * cloth)[..., None]
+    return woven
 
 
 def _inflatable(rng: np.random.Generator) -> np.ndarray:
@@ -594,7 +592,8 @@ def _inflatable(rng: np.random.Generator) -> np.ndarray:
 
 
 def _creases(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    return np.abs(_clouds(rng, shape, (3, 5), 4)) * -0.25 + 0.08 * _clouds(rng, shape, (48, 48), 2)
+    creases: np.ndarray = np.abs(_clouds(rng, shape, (3, 5), 4)) * -0.25 + 0.08 * _clouds(rng, shape, (48, 48), 2)
+    return creases
 
 
 def _shirt(rng: np.random.Generator) -> np.ndarray:
@@ -606,7 +605,8 @@ def _shirt(rng: np.random.Generator) -> np.ndarray:
         box = picture[150:232, max(left, 0) : max(left, 0) + 126 if left >= 0 else left + 126]
         box[:] = (0.16, 0.20, 0.32)
         _letters(box, _word(np.random.default_rng(int(rng.integers(9))), 4), 20, 8 + min(left, 0), 5, (0.92, 0.88, 0.7))
-    return picture * (1 + _creases(rng, shape))[..., None]
+    worn: np.ndarray = picture * (1 + _creases(rng, shape))[..., None]
+    return worn
 
 
 def _plaid(rng: np.random.Generator) -> np.ndarray:
@@ -617,7 +617,8 @@ def _plaid(rng: np.random.Generator) -> np.ndarray:
     picture = _mix((0.16, 0.33, 0.30), (0.60, 0.66, 0.42), bands)
     picture = _mix(picture, (0.86, 0.74, 0.30), 0.8 * lines)
     buttons = (np.abs(x - 0.5) < 0.012) & (np.abs((y * 9) % 1 - 0.5) < 0.1)
-    return _mix(picture, (0.92, 0.90, 0.86), buttons) * (1 + _creases(rng, shape))[..., None]
+    worn: np.ndarray = _mix(picture, (0.92, 0.90, 0.86), buttons) * (1 + _creases(rng, shape))[..., None]
+    return worn
 
 
 def _skin(rng: np.random.Generator) -> np.ndarray:

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studio.clocks import CameraTimes
+from studio.film_set import MOVING, OBJECTS
 from studio.raycast import Hits, Motion
 from studio.rig import StudioCamera
-from studio.scene import MOVING, OBJECTS
 
 VERSION = 1
 MOVES, SEEN = 1, 2

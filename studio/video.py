@@ -32,12 +32,14 @@ class VideoWriter:
         context.gop_size = KEYFRAME_INTERVAL
         context.color_primaries = context.color_trc = context.colorspace = BT709
         context.color_range = LIMITED_RANGE
-        self._stream, self._count = stream, 0
+        self._stream, self._count, self._frame_s = stream, 0, 1 / fps
 
     def write(self, srgb: np.ndarray) -> None:
         """Append a picture, uint8 [H, W, 3], sRGB."""
         frame = av.VideoFrame.from_ndarray(yuv_from_srgb(srgb), format="yuv420p")
-        frame.pts, frame.time_base = self._count, self._stream.time_base
+        # not the stream's unit: the muxer changes it with the header, which it writes before x264's first packet, and
+        # that comes with picture 33
+        frame.pts, frame.time_base = self._count, self._frame_s
         frame.colorspace, frame.color_range = BT709, LIMITED_RANGE
         self._count += 1
         self._container.mux(self._stream.encode(frame))
@@ -66,7 +68,7 @@ def yuv_from_srgb(srgb: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _to_yuv(srgb, luma, blue, red):
+def _to_yuv(srgb: np.ndarray, luma: np.ndarray, blue: np.ndarray, red: np.ndarray) -> None:
     for row in range(blue.shape[0]):
         for column in range(blue.shape[1]):
             r, g, b = 0.0, 0.0, 0.0

@@ -189,9 +189,15 @@ def _rough_line(x: np.ndarray, residuals: np.ndarray, period: int) -> tuple[floa
 
 
 def _refine(
-    reference: np.ndarray, camera: np.ndarray, period: int, origin: int, offset: float, drift: float, *,
+    reference: np.ndarray,
+    camera: np.ndarray,
+    period: int,
+    origin: int,
+    offset: float,
+    drift: float,
+    *,
     level: bool = False,
-) -> _Line | None:  # fmt: skip
+) -> _Line | None:
     """Match under the estimate, fit what is left, add it; up to three times. None if too few frames match."""
     line = None
     for _ in range(3):

@@ -109,7 +109,7 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
 
 
 def _check_whole(
-    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: list[av.Packet]
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: list[av.Packet[av.VideoStream]]
 ) -> None:
     if not packets:
         raise ValueError(f"{path} holds no frames; copy the recording again")
@@ -126,7 +126,9 @@ def _check_whole(
         )
 
 
-def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: list[av.Packet]) -> list[int]:
+def _presentation_times(
+    path: Path, name: str, stream: av.VideoStream, packets: list[av.Packet[av.VideoStream]]
+) -> list[int]:
     hidden = sum(packet.is_discard for packet in packets)
     if hidden:
         raise ValueError(
@@ -160,7 +162,7 @@ def _declared_end_s(stream: av.VideoStream) -> Fraction | None:
     return sum((Fraction(part) * 60**power for power, part in zip((2, 1, 0), parts, strict=True)), Fraction(0))
 
 
-def _found_end_s(stream: av.VideoStream, packets: list[av.Packet]) -> Fraction:
+def _found_end_s(stream: av.VideoStream, packets: list[av.Packet[av.VideoStream]]) -> Fraction:
     assert stream.time_base is not None
     last = max((packet.pts or 0) + (packet.duration or 0) for packet in packets)
     return last * stream.time_base

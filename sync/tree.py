@@ -275,7 +275,7 @@ def _settle(left: np.ndarray, right: np.ndarray, height: np.ndarray, node: int) 
 
 @njit(cache=True, error_model="numpy")
 def _rotate_right(left: np.ndarray, right: np.ndarray, height: np.ndarray, node: int) -> int:
-    top = left[node]
+    top: int = left[node]
     left[node] = right[top]
     right[top] = node
     _settle(left, right, height, node)
@@ -285,7 +285,7 @@ def _rotate_right(left: np.ndarray, right: np.ndarray, height: np.ndarray, node:
 
 @njit(cache=True, error_model="numpy")
 def _rotate_left(left: np.ndarray, right: np.ndarray, height: np.ndarray, node: int) -> int:
-    top = right[node]
+    top: int = right[node]
     right[node] = left[top]
     left[top] = node
     _settle(left, right, height, node)
@@ -347,9 +347,16 @@ def _retrace(left: np.ndarray, right: np.ndarray, height: np.ndarray, path: np.n
 
 @njit(cache=True, error_model="numpy")
 def _insert(
-    keys: np.ndarray, values: np.ndarray, left: np.ndarray, right: np.ndarray, height: np.ndarray,
-    root: int, count: int, times: np.ndarray, frames: np.ndarray,
-) -> tuple[int, int]:  # fmt: skip
+    keys: np.ndarray,
+    values: np.ndarray,
+    left: np.ndarray,
+    right: np.ndarray,
+    height: np.ndarray,
+    root: int,
+    count: int,
+    times: np.ndarray,
+    frames: np.ndarray,
+) -> tuple[int, int]:
     """Insert one by one; the root and the number of nodes afterwards."""
     path = np.empty(_MOST_LEVELS, np.int32)
     for i in range(times.size):

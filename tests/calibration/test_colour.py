@@ -29,10 +29,18 @@ def observed(
     colour[shiny] *= rng.uniform(1.3, 2.5, (int(shiny.sum()), 1))
     rig = ring(CAMERAS)
     return SparsePoints(
-        rig.names, np.zeros((points, 3)), np.zeros((points, 3), np.uint8), np.full(points, 4, np.int32),
-        np.zeros(points, np.float32), np.zeros(points, np.int32), point, camera, np.zeros((4 * points, 2), np.float32),
-        colour.astype(np.float32), matches_report(rig, []),
-    )  # fmt: skip
+        cameras=rig.names,
+        xyz=np.zeros((points, 3)),
+        rgb=np.zeros((points, 3), np.uint8),
+        views=np.full(points, 4, np.int32),
+        error_px=np.zeros(points, np.float32),
+        instant=np.zeros(points, np.int32),
+        point=point,
+        camera=camera,
+        xy=np.zeros((4 * points, 2), np.float32),
+        colour=colour.astype(np.float32),
+        matches=matches_report(rig, []),
+    )
 
 
 def random_gains(seed: int = 1, spread: float = 0.2) -> np.ndarray:

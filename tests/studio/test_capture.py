@@ -24,9 +24,9 @@ from studio.capture import (
     srgb_picture,
 )
 from studio.clocks import EPOCH_NS, SECOND_NS, ClockOptions
+from studio.film_set import FilmSet, build_set
 from studio.raycast import cast, follow, look_once, render
-from studio.rig import RigKind, RigOptions, place_cameras
-from studio.scene import Scene, build_scene
+from studio.rig import PlacementOptions, RigKind, place_cameras
 from studio.truth import Truth, read_truth
 from studio.video import yuv_from_srgb
 from sync.capture import find_capture, load_timecodes
@@ -56,8 +56,8 @@ def truth(capture: Path) -> Truth:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return build_scene(7, SMALL.entrance_share * SMALL.frames / 30)
+def film_set() -> FilmSet:
+    return build_set(7, SMALL.entrance_share * SMALL.frames / 30)
 
 
 def seconds(time_ns: int) -> float:
@@ -112,19 +112,21 @@ def test_calibration_is_the_rig_that_filmed(capture: Path, truth: Truth) -> None
 
 
 def test_pictures_are_the_room_at_the_true_time_with_the_camera_s_gains(
-    capture: Path, truth: Truth, scene: Scene
+    capture: Path, truth: Truth, film_set: FilmSet
 ) -> None:
     for name in ("cam01", "cam04"):
         camera = truth.cameras[name]
         view = camera.camera.view
-        backdrop = look_once(view, scene.standing, scene.light, scene.colours, samples=2)
+        backdrop = look_once(view, film_set.standing, film_set.light, film_set.colours, samples=2)
         with av.open(str(capture / "videos" / f"{name}.mp4")) as container:
             pictures = [frame.to_ndarray(format="yuv420p") for frame in container.decode(video=0)]
             stream = container.streams.video[0].codec_context
             assert (stream.colorspace, stream.color_primaries, stream.color_range) == (1, 1, 1)
         for index in (0, len(camera) - 1):
-            moment = scene.at(seconds(camera.times.times_ns[index]))
-            light = render(view, backdrop, scene.standing, moment.movers, moment.blockers, scene.light, scene.colours)
+            moment = film_set.at(seconds(camera.times.times_ns[index]))
+            light = render(
+                view, backdrop, film_set.standing, moment.movers, moment.blockers, film_set.light, film_set.colours
+            )
             expected = yuv_from_srgb(srgb_picture(light, camera.gains))
             error = pictures[index].astype(float) - expected
             # what H.264 loses at crf 14; measured: 1.2 to 2.0
@@ -143,14 +145,14 @@ def test_video_colours_are_bt709_limited_range() -> None:
         assert np.abs([planes[0, 0], planes[2, 0], planes[2, 1]] - np.array(expected)).max() <= 0.5 + 1e-9
 
 
-def test_truth_per_pixel_is_the_ray_caster_s(truth: Truth, scene: Scene) -> None:
+def test_truth_per_pixel_is_the_ray_caster_s(truth: Truth, film_set: FilmSet) -> None:
     camera = truth.cameras["cam02"]
     view = camera.camera.view
-    backdrop = look_once(view, scene.standing, scene.light, scene.colours, samples=1)
+    backdrop = look_once(view, film_set.standing, film_set.light, film_set.colours, samples=1)
     for index in (0, len(camera) - 1):
-        now, later = (scene.at(seconds(t[index])) for t in (camera.times.times_ns, camera.times.next_times_ns))
+        now, later = (film_set.at(seconds(t[index])) for t in (camera.times.times_ns, camera.times.next_times_ns))
         hits = cast(view, backdrop, now.movers)
-        motion = follow(view, hits, scene.standing, now.movers, later.movers)
+        motion = follow(view, hits, film_set.standing, now.movers, later.movers)
         frame = camera.frame(index)
         assert np.array_equal(frame.depth, hits.depth.astype(np.float32))
         assert np.array_equal(frame.object, hits.owner)
@@ -186,9 +188,16 @@ def test_free_running_cameras_film_between_the_ticks(tmp_path: Path) -> None:
 
 def test_light_truth_and_no_calibration(tmp_path: Path) -> None:
     options = SimulateOptions(
-        cameras=2, frames=3, size="64x36", seed=7, clock=ClockOptions(max_late_frames=1), truth=TruthKind.LIGHT,
-        calibration=CalibrationKind.NONE, fps=Fraction(30000, 1001), name="bare",
-    )  # fmt: skip
+        cameras=2,
+        frames=3,
+        size="64x36",
+        seed=7,
+        clock=ClockOptions(max_late_frames=1),
+        truth=TruthKind.LIGHT,
+        calibration=CalibrationKind.NONE,
+        fps=Fraction(30000, 1001),
+        name="bare",
+    )
     simulate(tmp_path / "bare", options)
     found = find_capture(tmp_path / "bare")
     assert found.calibration is None
@@ -267,14 +276,16 @@ def test_quaternions_give_back_the_rotation() -> None:
 
 
 @pytest.mark.slow
-def test_pictures_have_features_that_match(scene: Scene) -> None:
+def test_pictures_have_features_that_match(film_set: FilmSet) -> None:
     """At 640x360 there are SIFT features in plenty, and neighbours of a ring share them at the true place."""
-    moment = scene.at(0.1)
+    moment = film_set.at(0.1)
     found = []
-    for camera in place_cameras([f"cam{k}" for k in range(16)], 640, 360, 7, RigOptions(RigKind.RING))[:4]:
+    for camera in place_cameras([f"cam{k}" for k in range(16)], 640, 360, 7, PlacementOptions(RigKind.RING))[:4]:
         view = camera.view
-        backdrop = look_once(view, scene.standing, scene.light, scene.colours, samples=2)
-        light = render(view, backdrop, scene.standing, moment.movers, moment.blockers, scene.light, scene.colours)
+        backdrop = look_once(view, film_set.standing, film_set.light, film_set.colours, samples=2)
+        light = render(
+            view, backdrop, film_set.standing, moment.movers, moment.blockers, film_set.light, film_set.colours
+        )
         grey = cv2.cvtColor(srgb_picture(light, np.ones(3)), cv2.COLOR_RGB2GRAY)
         points, descriptors = cv2.SIFT_create().detectAndCompute(grey, None)
         assert len(points) >= 300

@@ -4,35 +4,37 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numba.core.types import NamedTuple
 
+from studio.film_set import MOVING, OBJECTS, FilmSet, Moment, build_set
 from studio.geometry import Look, Parts, turn_about_z
-from studio.raycast import Backdrop, Hits, Motion, View, cast, follow, look_once, render
-from studio.rig import RigKind, RigOptions, StudioCamera, place_cameras
-from studio.scene import MOVING, OBJECTS, Moment, Scene, build_scene
-from studio.textures import Textures, linear_from_srgb, srgb_from_linear
+from studio.raycast import Backdrop, Hits, Motion, View, cast, follow, kernels, look_once, render
+from studio.rig import PlacementOptions, RigKind, StudioCamera, place_cameras
+from studio.srgb import linear_from_srgb, srgb_from_linear
+from studio.textures import Textures
 
 WIDTH, HEIGHT = 320, 180
 NOW, LATER, ENTRANCE = 0.50, 0.50 + 1 / 30, 0.3
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return build_scene(7, ENTRANCE)
+def film_set() -> FilmSet:
+    return build_set(7, ENTRANCE)
 
 
 @pytest.fixture(scope="module")
 def rig() -> tuple[StudioCamera, ...]:
-    return place_cameras([f"cam{i}" for i in range(8)], WIDTH, HEIGHT, 7, RigOptions(RigKind.RING))
+    return place_cameras([f"cam{i}" for i in range(8)], WIDTH, HEIGHT, 7, PlacementOptions(RigKind.RING))
 
 
 @pytest.fixture(scope="module")
-def backdrops(scene: Scene, rig: tuple[StudioCamera, ...]) -> list[Backdrop]:
-    return [look_once(camera.view, scene.standing, scene.light, scene.colours, samples=2) for camera in rig]
+def backdrops(film_set: FilmSet, rig: tuple[StudioCamera, ...]) -> list[Backdrop]:
+    return [look_once(camera.view, film_set.standing, film_set.light, film_set.colours, samples=2) for camera in rig]
 
 
 @pytest.fixture(scope="module")
-def moments(scene: Scene) -> tuple[Moment, Moment]:
-    return scene.at(NOW), scene.at(LATER)
+def moments(film_set: FilmSet) -> tuple[Moment, Moment]:
+    return film_set.at(NOW), film_set.at(LATER)
 
 
 def rays(view: View) -> np.ndarray:
@@ -64,8 +66,8 @@ def sampled(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return upper * (1 - b) + lower * b
 
 
-def picture_of(scene: Scene, camera: StudioCamera, backdrop: Backdrop, moment: Moment) -> np.ndarray:
-    args = (backdrop, scene.standing, moment.movers, moment.blockers, scene.light, scene.colours)
+def picture_of(film_set: FilmSet, camera: StudioCamera, backdrop: Backdrop, moment: Moment) -> np.ndarray:
+    args = (backdrop, film_set.standing, moment.movers, moment.blockers, film_set.light, film_set.colours)
     return render(camera.view, *args)
 
 
@@ -156,7 +158,7 @@ def test_a_mesh_of_a_sphere_is_hit_where_the_sphere_is() -> None:
     assert np.quantile(np.abs(mesh.depth[both] - solid.depth[both]), 0.95) < 2e-3
 
 
-def test_every_ray_meets_something_and_every_object_is_seen(scene, rig, backdrops, moments) -> None:
+def test_every_ray_meets_something_and_every_object_is_seen(film_set, rig, backdrops, moments) -> None:
     owners = set()
     for camera, backdrop in zip(rig, backdrops, strict=True):
         hits = cast(camera.view, backdrop, moments[0].movers)
@@ -167,17 +169,17 @@ def test_every_ray_meets_something_and_every_object_is_seen(scene, rig, backdrop
     assert owners == set(range(len(OBJECTS))) - {OBJECTS.index("lamp")}
 
 
-def test_one_object_comes_late(scene: Scene) -> None:
+def test_one_object_comes_late(film_set: FilmSet) -> None:
     """Before the door opens no camera sees the visitor; soon after, some do."""
     views = [
         camera.view
         for kind in RigKind
-        for camera in place_cameras([f"cam{k}" for k in range(9)], 160, 90, 3, RigOptions(kind))
+        for camera in place_cameras([f"cam{k}" for k in range(9)], 160, 90, 3, PlacementOptions(kind))
     ]
-    backdrops = [look_once(view, scene.standing, scene.light, scene.colours, samples=1) for view in views]
+    backdrops = [look_once(view, film_set.standing, film_set.light, film_set.colours, samples=1) for view in views]
     counts = []
     for seconds in (0.0, 0.15, ENTRANCE, ENTRANCE + 0.5, ENTRANCE + 2):
-        moment = scene.at(seconds)
+        moment = film_set.at(seconds)
         owners = [cast(v, b, moment.movers).owner for v, b in zip(views, backdrops, strict=True)]
         counts.append(sum((owner == OBJECTS.index("visitor")).sum() for owner in owners))
     assert counts[:3] == [0, 0, 0]
@@ -198,11 +200,11 @@ def test_depth_agrees_between_cameras(rig, backdrops, moments) -> None:
     assert behind.mean() < 0.02
 
 
-def test_flow_and_depth_carry_a_point_to_the_same_place(scene, rig, backdrops, moments) -> None:
+def test_flow_and_depth_carry_a_point_to_the_same_place(film_set, rig, backdrops, moments) -> None:
     """Where a pixel's point is seen again, the next picture's own truth has its depth and its object there."""
     for camera, backdrop in zip(rig[:4], backdrops, strict=False):
         now, later = (cast(camera.view, backdrop, moment.movers) for moment in moments)
-        motion = follow(camera.view, now, scene.standing, moments[0].movers, moments[1].movers)
+        motion = follow(camera.view, now, film_set.standing, moments[0].movers, moments[1].movers)
         target = points_of_pixels(camera.view) + motion.flow
         check = motion.moves & motion.seen
         column, row = target[check].astype(int).T
@@ -217,13 +219,13 @@ def points_of_pixels(view: View) -> np.ndarray:
     return np.stack([x, y], axis=2)
 
 
-def test_warping_by_the_flow_explains_the_next_picture(scene, rig, backdrops, moments) -> None:
+def test_warping_by_the_flow_explains_the_next_picture(film_set, rig, backdrops, moments) -> None:
     """Colours of moving points are found again where the flow says, far better than where they were."""
     moved, stayed = [], []
     for camera, backdrop in zip(rig, backdrops, strict=True):
-        first, second = (picture_of(scene, camera, backdrop, moment) for moment in moments)
+        first, second = (picture_of(film_set, camera, backdrop, moment) for moment in moments)
         hits = cast(camera.view, backdrop, moments[0].movers)
-        motion = follow(camera.view, hits, scene.standing, moments[0].movers, moments[1].movers)
+        motion = follow(camera.view, hits, film_set.standing, moments[0].movers, moments[1].movers)
         place = points_of_pixels(camera.view)
         target = place + motion.flow
         inside = (target > 2).all(-1) & (target < [WIDTH - 2, HEIGHT - 2]).all(-1)
@@ -248,9 +250,9 @@ def eroded(owner: np.ndarray) -> np.ndarray:
     return same
 
 
-def test_standing_points_have_no_flow_and_movers_move(scene, rig, backdrops, moments) -> None:
+def test_standing_points_have_no_flow_and_movers_move(film_set, rig, backdrops, moments) -> None:
     hits = cast(rig[0].view, backdrops[0], moments[0].movers)
-    motion = follow(rig[0].view, hits, scene.standing, moments[0].movers, moments[1].movers)
+    motion = follow(rig[0].view, hits, film_set.standing, moments[0].movers, moments[1].movers)
     movers = hits.owner >= OBJECTS.index(MOVING[0])
     assert not motion.moves[~movers].any()
     assert not motion.flow[~movers].any()
@@ -258,11 +260,11 @@ def test_standing_points_have_no_flow_and_movers_move(scene, rig, backdrops, mom
     assert np.isfinite(motion.flow).all()
 
 
-def test_what_is_not_seen_again_is_hidden_or_outside(scene, rig, backdrops, moments) -> None:
+def test_what_is_not_seen_again_is_hidden_or_outside(film_set, rig, backdrops, moments) -> None:
     hidden, nearer = 0, 0
     for camera, backdrop in zip(rig, backdrops, strict=True):
         now, later = (cast(camera.view, backdrop, moment.movers) for moment in moments)
-        motion = follow(camera.view, now, scene.standing, moments[0].movers, moments[1].movers)
+        motion = follow(camera.view, now, film_set.standing, moments[0].movers, moments[1].movers)
         target = points_of_pixels(camera.view) + motion.flow
         inside = (target >= 0).all(-1) & (target < [WIDTH, HEIGHT]).all(-1)
         assert not motion.seen[~inside].any()
@@ -277,28 +279,28 @@ def test_what_is_not_seen_again_is_hidden_or_outside(scene, rig, backdrops, mome
     assert nearer > 0.8 * hidden
 
 
-def test_nothing_moves_between_a_time_and_itself(scene, rig, backdrops, moments) -> None:
+def test_nothing_moves_between_a_time_and_itself(film_set, rig, backdrops, moments) -> None:
     hits = cast(rig[0].view, backdrops[0], moments[0].movers)
-    motion = follow(rig[0].view, hits, scene.standing, moments[0].movers, moments[0].movers)
+    motion = follow(rig[0].view, hits, film_set.standing, moments[0].movers, moments[0].movers)
     assert not motion.moves.any()
     assert not motion.flow.any()
     # every visible point stays visible: no surface hides itself
     assert motion.seen.all()
 
 
-def test_motion_is_of_a_natural_size(scene, rig, backdrops, moments) -> None:
+def test_motion_is_of_a_natural_size(film_set, rig, backdrops, moments) -> None:
     """At 640x360, twice the size here, fast limbs go 8 to 10 pixels between frames."""
     sizes = []
     for camera, backdrop in zip(rig, backdrops, strict=True):
         hits = cast(camera.view, backdrop, moments[0].movers)
-        motion: Motion = follow(camera.view, hits, scene.standing, moments[0].movers, moments[1].movers)
+        motion: Motion = follow(camera.view, hits, film_set.standing, moments[0].movers, moments[1].movers)
         sizes.append(2 * np.hypot(*motion.flow.transpose(2, 0, 1))[motion.moves])
     size = np.concatenate(sizes)
     assert 0.5 < np.median(size) < 6
     assert 4 < np.quantile(size, 0.99) < 16
 
 
-def test_one_room_is_painted_for_all_cameras(scene, rig, backdrops, moments) -> None:
+def test_one_room_is_painted_for_all_cameras(film_set, rig, backdrops, moments) -> None:
     """Points seen by two cameras have the same colour in both: shading is the world's, not the camera's."""
     first, second = rig[1].view, rig[2].view
     depth = cast(first, backdrops[1], moments[0].movers).depth
@@ -307,34 +309,45 @@ def test_one_room_is_painted_for_all_cameras(scene, rig, backdrops, moments) -> 
     inside = (ahead > 0.1) & (pixels > 2).all(-1) & (pixels < [WIDTH - 2, HEIGHT - 2]).all(-1)
     column, row = pixels[inside].astype(int).T
     agree = np.abs(other.depth[row, column] - ahead[inside]) < 0.02
-    a = picture_of(scene, rig[1], backdrops[1], moments[0])[inside][agree]
-    b = sampled(picture_of(scene, rig[2], backdrops[2], moments[0]), pixels[inside][agree])
+    a = picture_of(film_set, rig[1], backdrops[1], moments[0])[inside][agree]
+    b = sampled(picture_of(film_set, rig[2], backdrops[2], moments[0]), pixels[inside][agree])
     assert agree.sum() > 5000
     for channel in range(3):
         assert np.corrcoef(a[:, channel], b[:, channel])[0, 1] > 0.8
     assert abs(a.mean() / b.mean() - 1) < 0.05
 
 
-def test_pictures_are_the_same_every_time(scene, rig, backdrops, moments) -> None:
-    again = look_once(rig[3].view, scene.standing, scene.light, scene.colours, samples=2)
+def test_pictures_are_the_same_every_time(film_set, rig, backdrops, moments) -> None:
+    again = look_once(rig[3].view, film_set.standing, film_set.light, film_set.colours, samples=2)
     assert all(np.array_equal(a, b) for a, b in zip(again, backdrops[3], strict=True))
-    first = picture_of(scene, rig[3], backdrops[3], moments[0])
-    assert np.array_equal(first, picture_of(scene, rig[3], again, scene.at(NOW)))
+    first = picture_of(film_set, rig[3], backdrops[3], moments[0])
+    assert np.array_equal(first, picture_of(film_set, rig[3], again, film_set.at(NOW)))
     assert 0.08 < first.mean() < 0.35
     assert (first >= 0).all()
     assert (first > 1).mean() < 0.01
 
 
-def test_more_rays_converge(scene, rig, moments) -> None:
+def test_more_rays_converge(film_set, rig, moments) -> None:
     """Pictures with 2 x 2 rays are close to those with 6 x 6, and closer than those with one."""
-    camera = place_cameras(["a"], 160, 90, 7, RigOptions())[0]
+    camera = place_cameras(["a"], 160, 90, 7, PlacementOptions())[0]
     pictures = []
     for samples in (1, 2, 6):
-        backdrop = look_once(camera.view, scene.standing, scene.light, scene.colours, samples=samples)
-        pictures.append(picture_of(scene, camera, backdrop, moments[0]))
+        backdrop = look_once(camera.view, film_set.standing, film_set.light, film_set.colours, samples=samples)
+        pictures.append(picture_of(film_set, camera, backdrop, moments[0]))
     one, two = (np.abs(picture - pictures[2]).mean() for picture in pictures[:2])
     assert two < 0.6 * one
     assert two < 0.02
+
+
+def test_tuples_are_laid_out_in_the_file_of_the_kernels_that_read_them(film_set, rig, backdrops, moments) -> None:
+    # The order of a tuple's fields is compiled in, and Numba's cache would not notice that another file changed it.
+    view, backdrop, (now, later) = rig[0].view, backdrops[0], moments
+    render(view, backdrop, film_set.standing, now.movers, now.blockers, film_set.light, film_set.colours)
+    follow(view, cast(view, backdrop, now.movers), film_set.standing, now.movers, later.movers)
+    for kernel in (kernels.fill_backdrop, kernels.fill_picture, kernels.fill_hits, kernels.fill_motion):
+        kinds = [kind for signature in kernel.signatures for kind in signature]
+        homes = {kind.instance_class.__module__ for kind in kinds if isinstance(kind, NamedTuple)}
+        assert homes == {kernels.__name__}
 
 
 def test_srgb_round_trip() -> None:

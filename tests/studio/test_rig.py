@@ -7,24 +7,24 @@ import pytest
 
 from calibration.accept import check_rig
 from calibration.rig import Camera, Rig
-from studio.rig import FARTHEST_M, NEAREST_M, TARGET, RigKind, RigOptions, StudioCamera, place_cameras
-from studio.scene import VISITOR_FROM, VISITOR_TO, VISITOR_X, Scene, build_scene
+from studio.film_set import VISITOR_FROM, VISITOR_TO, VISITOR_X, FilmSet, build_set
+from studio.rig import FARTHEST_M, NEAREST_M, TARGET, PlacementOptions, RigKind, StudioCamera, place_cameras
 
 KINDS = list(RigKind)
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return build_scene(7, 0.3)
+def film_set() -> FilmSet:
+    return build_set(7, 0.3)
 
 
 def rig_of(kind: RigKind, count: int, seed: int, radius_m: float = 3.1) -> tuple[StudioCamera, ...]:
-    return place_cameras([f"cam{k}" for k in range(count)], 640, 360, seed, RigOptions(kind, radius_m))
+    return place_cameras([f"cam{k}" for k in range(count)], 640, 360, seed, PlacementOptions(kind, radius_m))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("radius_m", [NEAREST_M, 3.1, FARTHEST_M])
-def test_cameras_stand_free_and_look_at_the_scene(scene: Scene, kind: RigKind, radius_m: float) -> None:
+def test_cameras_stand_free_and_look_at_the_scene(film_set: FilmSet, kind: RigKind, radius_m: float) -> None:
     for count in (2, 8, 27, 60):
         for seed in range(3):
             for camera in rig_of(kind, count, seed, radius_m):
@@ -32,7 +32,7 @@ def test_cameras_stand_free_and_look_at_the_scene(scene: Scene, kind: RigKind, r
                 assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
                 assert np.isclose(np.linalg.det(rotation), 1)
                 # a lens closer than this to furniture sees nothing else
-                assert scene.clear_of(camera.centre) > 0.15
+                assert film_set.clear_of(camera.centre) > 0.15
                 local = rotation @ (TARGET - camera.centre)
                 pixel = camera.fx * local[:2] / local[2]
                 assert local[2] > 1.5
@@ -64,7 +64,7 @@ def test_rigs_are_irregular_by_seed_alone() -> None:
     distances = [np.linalg.norm(a.centre - b.centre) for a, b in zip(first, other, strict=True)]
     assert min(distances) > 0.005
     assert max(distances) < 0.5
-    regular = place_cameras(["a", "b"], 640, 360, 1, RigOptions(jitter_m=0.0))
+    regular = place_cameras(["a", "b"], 640, 360, 1, PlacementOptions(jitter_m=0.0))
     assert np.allclose([np.hypot(*c.centre[:2]) for c in regular], 3.1)
     assert [(c.fx, c.cx, c.cy) for c in regular] == [(480.0, 320.0, 180.0)] * 2
 
@@ -81,4 +81,4 @@ def test_rigs_are_irregular_by_seed_alone() -> None:
 )
 def test_bad_options_are_refused(options, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RigOptions(**options)
+        PlacementOptions(**options)

@@ -112,8 +112,10 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
 def test_timecodes_are_found_by_camera_or_shared(tmp_path: Path) -> None:
     own = make_capture(tmp_path / "own", *VIDEOS, *(f"timecodes/cam{n}.txt" for n in (1, 2, 10)), "timecodes/.hidden")
     assert {camera: path.name for camera, path in find_capture(own).timecodes.items()} == {
-        "cam1": "cam1.txt", "cam2": "cam2.txt", "cam10": "cam10.txt"
-    }  # fmt: skip
+        "cam1": "cam1.txt",
+        "cam2": "cam2.txt",
+        "cam10": "cam10.txt",
+    }
     shared = make_capture(tmp_path / "shared", *VIDEOS, "timecodes/timestamps.csv")
     assert set(find_capture(shared).timecodes.values()) == {shared / "timecodes" / "timestamps.csv"}
 

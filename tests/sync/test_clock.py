@@ -50,9 +50,15 @@ def offset_at_start(clock: Clock) -> float:
 )
 @pytest.mark.parametrize("seed", range(3))
 def test_a_triggered_clock_is_recovered(
-    fps: float, seconds: float, offset_us: float, drift_ppm: float, noise: dict, worst_offset_us: float,
-    worst_drift_ppm: float, seed: int,
-) -> None:  # fmt: skip
+    fps: float,
+    seconds: float,
+    offset_us: float,
+    drift_ppm: float,
+    noise: dict,
+    worst_offset_us: float,
+    worst_drift_ppm: float,
+    seed: int,
+) -> None:
     rng = np.random.default_rng(seed)
     taken = exposures(rng, fps, seconds, 200)
     reference = stamps(rng, taken, **noise)

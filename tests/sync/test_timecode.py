@@ -5,13 +5,16 @@ import json
 from decimal import ROUND_HALF_UP, Decimal
 from fractions import Fraction
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import sync.timecode
+import sync.timecode.labels
+import sync.timecode.rates
+import sync.timecode.read
 from sync.timecode import (
     Timecodes,
     frame_numbers,
@@ -417,6 +420,8 @@ def test_timecodes_check_themselves(times: np.ndarray, indices: np.ndarray, mess
         Timecodes(times, indices)
 
 
-def test_docstring_examples_hold() -> None:
-    assert doctest.testmod(sync.timecode).failed == 0
-    assert doctest.testmod(sync.timecode).attempted > 3
+@pytest.mark.parametrize("module", [sync.timecode.labels, sync.timecode.rates, sync.timecode.read])
+def test_docstring_examples_hold(module: ModuleType) -> None:
+    results = doctest.testmod(module)
+    assert results.failed == 0
+    assert results.attempted > 0

@@ -1,21 +1,16 @@
-"""The ray caster: pictures in linear light, and what each pixel's centre ray meets and where that goes.
+"""All that the ray caster compiles, and what its compiled code reads.
 
-The cameras and most of the room stand still, so what a camera sees of the room is worked out once (`Backdrop`), and
-each picture traces only what moves, its shadows, and the light it takes from corners.
-
-Pixels, axes: the centre of the top-left pixel is (0.5, 0.5); camera axes are OpenCV's, x right, y down, z forward.
-A ray is centre + t * direction with a direction that has length 1 along the camera's z, so t is depth.
+Numba keeps machine code until the file that holds the function changes, whatever happens in other files. Functions,
+constants and the order of a tuple's fields are compiled in, so all these stand together here, and what other modules
+know (linear light of sRGB) comes as an argument.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-
-from studio.textures import Textures, linear_from_srgb
 
 BOX, ELLIPSOID, CYLINDER, CONE = range(4)
 """Canonical forms: the cube [-1, 1]^3; the unit sphere; radius 1 and z in [-1, 1], closed; and the hull of two
@@ -31,8 +26,6 @@ BLACK = 0.0
 APERTURE_PX, PAINT_BLUR_PX = 1.6, 1.2
 """A pixel's rays spread over this width, and paint is averaged over that. A real lens and sensor are no sharper; with
 rays inside the pixel alone, halving the chroma left 30 to 32 dB of a 320x180 picture, with this 34 to 35"""
-
-_LIGHT = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
 _PI = float(np.pi)
 
 
@@ -112,6 +105,8 @@ class Paints(NamedTuple):
     texels: np.ndarray
     start: np.ndarray
     size: np.ndarray
+    light: np.ndarray
+    """float32 [256]: linear light of a texel's sRGB values"""
 
 
 class Backdrop(NamedTuple):
@@ -131,98 +126,15 @@ class Backdrop(NamedTuple):
     """uint8 [H, W]: object it meets"""
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """What the centre ray of each pixel meets."""
-
-    depth: np.ndarray
-    """float64 [H, W]: along the camera's z axis, metres"""
-    owner: np.ndarray
-    """uint8 [H, W]: object"""
-    item: np.ndarray
-    """int32 [H, W]: item of the movers' shapes, -1 where the standing room is seen"""
-    place: np.ndarray
-    """float64 [H, W, 3]: canonical coordinates on a solid, weights of the corners on a triangle"""
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Where the points that the pixels' centre rays meet go."""
-
-    flow: np.ndarray
-    """float64 [H, W, 2]: displacement in x and y, pixels; 0 for what stands still"""
-    moves: np.ndarray
-    """bool [H, W]: the point moves in the world"""
-    seen: np.ndarray
-    """bool [H, W]: the point is inside the next picture and nothing hides it there"""
-
-
-def paints(textures: Textures) -> Paints:
-    """The part of the textures that the kernels need."""
-    return Paints(textures.texels, textures.start, textures.size)
-
-
-def look_once(view: View, standing: Shapes, light: Light, colours: Paints, *, samples: int) -> Backdrop:
-    """What a camera sees of the standing room, with samples x samples rays per pixel on a fixed grid."""
-    shape = (view.height, view.width, samples * samples)
-    backdrop = Backdrop(
-        np.empty(shape, np.float32),
-        np.empty((*shape, 3), np.float32),
-        np.empty((*shape, 3), np.float32),
-        np.empty((*shape, 3), np.float32),
-        np.empty(shape[:2]),
-        np.empty(shape[:2], np.uint8),
-    )
-    _look_once(view, standing, light, colours, samples, backdrop)
-    return backdrop
-
-
-def render(
-    view: View,
-    backdrop: Backdrop,
-    standing: Shapes,
-    movers: Shapes,
-    blockers: np.ndarray,  # float64 [B, 4], balls x y z radius that stand for the movers in ambient light
-    light: Light,
-    colours: Paints,
-) -> np.ndarray:
-    """A picture in linear light, float32 [H, W, 3], with the backdrop's samples per pixel.
-
-    Shading: Lambert from the key light with shadows, ambient light with contact occlusion, and a mirror lobe on
-    glossy surfaces.
-    """
-    out = np.empty((view.height, view.width, 3), np.float32)
-    _render(view, backdrop, standing, movers, blockers, light, colours, out)
-    return out
-
-
-def cast(view: View, backdrop: Backdrop, movers: Shapes) -> Hits:
-    """What the ray through each pixel's centre meets first."""
-    shape = (view.height, view.width)
-    hits = Hits(
-        backdrop.centre_depth.copy(), backdrop.centre_owner.copy(), np.empty(shape, np.int32), np.empty((*shape, 3))
-    )
-    _cast(view, movers, hits.depth, hits.owner, hits.item, hits.place)
-    return hits
-
-
-def follow(view: View, hits: Hits, standing: Shapes, now: Shapes, later: Shapes) -> Motion:
-    """Carry the points hit now to where their surface is later, and look at them again with the same camera.
-
-    Args:
-        now, later: the movers at both times.
-    """
-    shape = (view.height, view.width)
-    motion = Motion(np.empty((*shape, 2)), np.empty(shape, np.bool_), np.empty(shape, np.bool_))
-    _follow(view, hits.depth, hits.item, hits.place, standing, now, later, motion.flow, motion.moves, motion.seen)
-    return motion
-
-
 # Only compiled code calls these. They allocate nothing, so they need no reference counts of arrays: left on, these take
 # half of the run time, for each call counts every array of the tuples that it is given.
 _INNER: dict[str, Any] = {
-    "cache": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False
-}  # fmt: skip
+    "cache": True,
+    "error_model": "numpy",
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+    "_nrt": False,
+}
 _kernel = numba.njit(**_INNER)
 _inline = numba.njit(**_INNER, forceinline=True)
 
@@ -510,13 +422,13 @@ def _texel(colours, texture, level, u, v):
     # sides are powers of two, so that a mask wraps
     left, right = int(fx) & (width - 1), (int(fx) + 1) & (width - 1)
     upper, lower = start + (int(fy) & (height - 1)) * width, start + ((int(fy) + 1) & (height - 1)) * width
-    t, one = colours.texels, np.float32(1)
+    t, light, one = colours.texels, colours.light, np.float32(1)
     a, b, c, d = (one - sx) * (one - sy), sx * (one - sy), (one - sx) * sy, sx * sy
     i, j, k, m = upper + left, upper + right, lower + left, lower + right
     return (
-        a * _LIGHT[t[i, 0]] + b * _LIGHT[t[j, 0]] + c * _LIGHT[t[k, 0]] + d * _LIGHT[t[m, 0]],
-        a * _LIGHT[t[i, 1]] + b * _LIGHT[t[j, 1]] + c * _LIGHT[t[k, 1]] + d * _LIGHT[t[m, 1]],
-        a * _LIGHT[t[i, 2]] + b * _LIGHT[t[j, 2]] + c * _LIGHT[t[k, 2]] + d * _LIGHT[t[m, 2]],
+        a * light[t[i, 0]] + b * light[t[j, 0]] + c * light[t[k, 0]] + d * light[t[m, 0]],
+        a * light[t[i, 1]] + b * light[t[j, 1]] + c * light[t[k, 1]] + d * light[t[m, 1]],
+        a * light[t[i, 2]] + b * light[t[j, 2]] + c * light[t[k, 2]] + d * light[t[m, 2]],
     )
 
 
@@ -655,7 +567,7 @@ def _appearance(view, shapes, light, colours, hit, px, py, pz, dx, dy, dz, lamp)
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def _look_once(view, standing, light, colours, samples, out):
+def fill_backdrop(view, standing, light, colours, samples, out):
     for row in numba.prange(view.height):
         stack, entries = np.empty(DEEPEST, np.int32), np.empty(DEEPEST)
         for column in range(view.width):
@@ -693,7 +605,7 @@ def _look_sample(view, standing, light, colours, samples, column, row, k, out, s
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def _render(view, backdrop, standing, movers, blockers, light, colours, out):
+def fill_picture(view, backdrop, standing, movers, blockers, light, colours, out):
     count = backdrop.depth.shape[2]
     for row in numba.prange(view.height):
         stack, entries = np.empty(DEEPEST, np.int32), np.empty(DEEPEST)
@@ -748,7 +660,7 @@ def _sample(view, backdrop, standing, movers, blockers, light, colours, column, 
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def _cast(view, movers, depth, owner, items, place):
+def fill_hits(view, movers, depth, owner, items, place):
     for row in numba.prange(view.height):
         stack, entries = np.empty(DEEPEST, np.int32), np.empty(DEEPEST)
         o = view.centre
@@ -802,7 +714,7 @@ def _visible(view, shapes, px, py, pz, stack, entries):
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=True)
-def _follow(view, depth, items, place, standing, now, later, flow, moves, seen):
+def fill_motion(view, depth, items, place, standing, now, later, flow, moves, seen):
     for row in numba.prange(view.height):
         stack, entries = np.empty(DEEPEST, np.int32), np.empty(DEEPEST)
         for column in range(view.width):

@@ -44,8 +44,8 @@ class Moment:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """The room through time. `build_scene` makes it."""
+class FilmSet:
+    """The room through time. `build_set` makes it."""
 
     entrance_s: float
     """When the door begins to open"""
@@ -68,7 +68,7 @@ class Scene:
 
 
 @lru_cache(maxsize=2)
-def build_scene(seed: int, entrance_s: float) -> Scene:
+def build_set(seed: int, entrance_s: float) -> FilmSet:
     """Paint and furnish the room; takes some seconds, and is remembered."""
     textures = _textures(seed)
     parts = Parts(textures)
@@ -76,7 +76,7 @@ def build_scene(seed: int, entrance_s: float) -> Scene:
     add_room(parts, owners)
     add_furniture(parts, owners, np.random.default_rng([seed, 2]))
     standing = parts.shapes()
-    return Scene(entrance_s, standing, _light(standing), paints(textures), textures)
+    return FilmSet(entrance_s, standing, _light(standing), paints(textures), textures)
 
 
 def _light(standing: Shapes) -> Light:
@@ -100,7 +100,7 @@ def _textures(seed: int) -> Textures:
 # Each mover adds its shapes at a time and returns balls [B, 4] that stand for it where it darkens its surroundings.
 
 
-def _add_walker(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.ndarray:
+def _add_walker(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:
     way = WALK_SPEED * seconds
     angle = 2.2 + way / WALK_RADIUS
     place = (WALK_CENTRE[0] + WALK_RADIUS * np.cos(angle), WALK_CENTRE[1] + WALK_RADIUS * np.sin(angle))
@@ -109,8 +109,8 @@ def _add_walker(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.nd
     return add_figure(parts, owner, clothes, pose)
 
 
-def _add_visitor(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.ndarray:
-    since = seconds - scene.entrance_s - 0.15
+def _add_visitor(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:
+    since = seconds - film_set.entrance_s - 0.15
     way, speed = _way_in(since)
     arrived = _ease((since - (VISITOR_FROM - VISITOR_TO) / VISITOR_SPEED + 0.8) / 0.9)
     clothes = Clothes(
@@ -141,7 +141,7 @@ def _way_in(since_s: float) -> tuple[float, float]:
     return VISITOR_SPEED * (t - ramp / 2), 1.0
 
 
-def _add_ball(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.ndarray:
+def _add_ball(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:
     """Free fall from 0.42 m between bounces, a little squash at the floor, drifting and spinning."""
     radius, apex = 0.13, 0.42
     period = 2 * np.sqrt(2 * apex / GRAVITY)
@@ -162,14 +162,14 @@ def _add_ball(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.ndar
     return np.array([[*centre, radius]])
 
 
-def _add_crate(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.ndarray:
+def _add_crate(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:
     centre, half = np.array([-1.45, -1.2, 0.34 + 0.25]), 0.25
     look = Look("tiles", (1 / (2 * half), 1 / (2 * half)), (0.5, 0.5))
     parts.box(owner, centre, np.full(3, half), look, turn_about_z(1.1 * seconds + 0.4))
     return np.array([[*centre, half * 1.1]])
 
 
-def _add_banner(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.ndarray:
+def _add_banner(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:
     """A sheet that hangs from a rod; waves run across it and grow towards the hem."""
     u, v = np.meshgrid(np.linspace(0, 1, 21), np.linspace(0, 1, 17))
     swing = v**1.3 * (
@@ -183,7 +183,7 @@ def _add_banner(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.nd
     return np.zeros((0, 4))
 
 
-def _add_inflatable(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.ndarray:
+def _add_inflatable(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:
     """A tube that bends more towards its top while swellings run up along it."""
     share = np.linspace(1, 0, 22)[:, None]
     angle = np.linspace(0, 2 * np.pi, 23)[None, :]
@@ -207,9 +207,9 @@ def _add_inflatable(parts: Parts, owner: int, scene: Scene, seconds: float) -> n
     return np.array([[1.62, -1.08, 0.12, 0.17]])
 
 
-def _add_door(parts: Parts, owner: int, scene: Scene, seconds: float) -> np.ndarray:
+def _add_door(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:
     """A door that slides along the wall and uncovers the corridor."""
-    x = VISITOR_X + DOOR_TRAVEL * _ease((seconds - scene.entrance_s) / DOOR_SECONDS)
+    x = VISITOR_X + DOOR_TRAVEL * _ease((seconds - film_set.entrance_s) / DOOR_SECONDS)
     wide, high = DOOR_RIGHT - DOOR_LEFT + 0.08, DOOR_TOP + 0.06
     parts.box(
         owner,
@@ -238,7 +238,7 @@ def _about_x(angle_rad: float) -> np.ndarray:
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
-MOVERS: dict[str, Callable[[Parts, int, Scene, float], np.ndarray]] = {
+MOVERS: dict[str, Callable[[Parts, int, FilmSet, float], np.ndarray]] = {
     "walker": _add_walker,
     "visitor": _add_visitor,
     "ball": _add_ball,

@@ -1,0 +1,113 @@
+"""Timecode files of all kinds: one camera's own file, or a table that cameras share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from sync.timecode.columns import table_timecodes
+from sync.timecode.lines import read_lines
+from sync.timecode.rates import NANOSECONDS
+from sync.timecode.series import Timecodes
+from sync.timecode.tables import CAMERA_COLUMNS, Table, csv_table, json_table
+
+FASTEST_GAP_NS, SLOWEST_GAP_NS = 10_000, 3600 * NANOSECONDS
+"""No camera of a rig films faster than 100,000 or slower than one frame an hour: beyond, the unit is misread."""
+
+
+def read_timecodes(
+    path: Path, *, camera: str | None = None, rate: Fraction | None = None, column: str | None = None
+) -> Timecodes:
+    """Read one camera's timecodes from a .txt, .csv or .json file.
+
+    Args:
+        path: the file; docs/capture-folder.md describes the formats.
+        camera: whose rows to take from a table that holds several cameras.
+        rate: frames per second, needed for SMPTE labels only.
+        column: name of the time column, where a table has more than one.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a line that does not parse, with file, number and content; a table that leaves a choice open.
+    """
+    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    if not data.strip():
+        raise ValueError(f"{path} is empty; a camera needs at least one timecode")
+    kind = path.suffix.lower()
+    if kind == ".txt":
+        timecodes = read_lines(path, data, rate)
+    elif kind in (".csv", ".json"):
+        table = csv_table(path, data) if kind == ".csv" else json_table(path, data)
+        timecodes = table_timecodes(table, _rows_of(table, camera), rate, column)
+    else:
+        raise ValueError(f"timecodes are read from .txt, .csv or .json, but {path.name!r} is none of these")
+    _check_gaps(path, timecodes)
+    return timecodes
+
+
+def read_shared_timecodes(
+    path: Path, cameras: Sequence[str], *, rate: Fraction | None = None, column: str | None = None
+) -> dict[str, Timecodes]:
+    """Read the timecodes of several cameras from the one CSV table that they share.
+
+    Raises:
+        ValueError: as `read_timecodes`, or two cameras would take the same rows.
+    """
+    table = csv_table(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"))
+    if table.camera is None:
+        raise ValueError(f"{path} is shared by all cameras, so one of its columns must be {_either(CAMERA_COLUMNS)}")
+    ids = table.cameras
+    chosen = {camera: match_camera(camera, ids) for camera in cameras}
+    for name in chosen.values():
+        twins = [other for other in cameras if chosen[other] == name]
+        if len(twins) > 1:
+            raise ValueError(f"{path}: rows of {name!r} would serve cameras {twins}; give the rows the videos' names")
+    found = {camera: table_timecodes(table, table.rows_of(name), rate, column) for camera, name in chosen.items()}
+    for timecodes in found.values():
+        _check_gaps(path, timecodes)
+    return found
+
+
+def match_camera(camera: str, ids: Sequence[str]) -> str:
+    """Which of a table's camera ids means `camera`: the same text, else the number that ends the name.
+
+    >>> match_camera("cam_03", ["1", "2", "3"])
+    '3'
+
+    Raises:
+        ValueError: none or several fit.
+    """
+    if camera in ids:
+        return camera
+    number = re.search(r"\d+$", camera)
+    fits = [name for name in ids if number and name.isdecimal() and int(name) == int(number[0])]
+    if len(fits) != 1:
+        raise ValueError(f"camera {camera!r} must be one of the table's cameras {sorted(ids)}, or end in its number")
+    return fits[0]
+
+
+def _rows_of(table: Table, camera: str | None) -> np.ndarray | None:
+    """Rows of one camera, or None where the whole table is one camera's."""
+    if table.camera is None:
+        return None
+    ids = table.cameras
+    if camera is None and len(ids) > 1:
+        raise ValueError(f"{table.path} holds cameras {sorted(ids)}; say which one to read")
+    return table.rows_of(match_camera(camera, ids) if camera is not None and len(ids) > 1 else ids[0])
+
+
+def _check_gaps(path: Path, timecodes: Timecodes) -> None:
+    """Refuse a unit that no camera fits, by the gaps between the first thousand lines."""
+    gaps = np.abs(np.diff(timecodes.times_ns[:1000]))
+    gaps = gaps[gaps > 0]
+    median = int(np.median(gaps)) if len(gaps) else FASTEST_GAP_NS
+    if not FASTEST_GAP_NS <= median <= SLOWEST_GAP_NS:
+        raise ValueError(f"{path}: frames would be {median} ns apart, so the unit is another; name it in the column")
+
+
+def _either(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + " or " + names[-1]
