@@ -36,7 +36,7 @@ from packuv.gaussians.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_
 from packuv.scene import EncodeOptions, Scene, SceneHeader, open_scene, write_scene
 from packuv.scene.encoder import TOLERANCES, Quality
 from packuv.scene.header import DYNAMIC, KEY
-from packuv.scene.matroska import Encoder, Track
+from packuv.scene.matroska import Encoder, VideoTrack
 from packuv.scene.stream import channel_names, key_rows
 from packuv.score import Artist, spread
 from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
@@ -143,7 +143,7 @@ def measure_plain_atlas(
     channels = len(channel_names(quantizer.sh_degree))
     across = int(np.ceil(np.sqrt(channels)))
     down = -(-channels // across)
-    encoder = Encoder(Track("atlas", width * across, height * down, across * down))
+    encoder = Encoder(VideoTrack("atlas", width * across, height * down, across * down))
     total, seconds = 0, 0.0
     sizes: list[int] = []
     rows: list[int] = []

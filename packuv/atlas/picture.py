@@ -19,7 +19,6 @@ from packuv.gaussians.codes import DC, OPACITY, REST, ROTATION, SCALE, Codes, Qu
 from packuv.gaussians.floats import SH_C0
 from packuv.gaussians.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
 from packuv.scene import Scene
-from packuv.scene.reader import segment_of
 
 POSITION_HI, POSITION_LO, OPACITIES = "position_hi", "position_lo", "opacity"
 """Triplets that are not three columns of the attributes; the third holds opacity, 255 where dynamic, and 0."""
@@ -136,8 +135,7 @@ def sheet(scene: Scene, frame: int, *, options: UvOptions, triplet: str | None =
     degree = scene.header.quantizer.sh_degree
     if triplet is not None and triplet not in triplet_names(degree):
         raise ValueError(f"the scene has the triplets {', '.join(triplet_names(degree))}, but not {triplet!r}")
-    number = segment_of(scene, frame)
-    seating, codes = seat(scene, number, options=options), scene.codes(frame)
+    seating, codes = seat(scene, scene.segment_at(frame), options=options), scene.codes(frame)
     pictures = draw_triplets(codes, seating, sh_degree=degree, options=options)
     if triplet is not None:
         return pictures[triplet]

@@ -37,7 +37,7 @@ from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.uvmap import UvOptions
 from packuv.progress import Progress, no_progress
 from packuv.scene import Scene, SceneHeader, open_scene
-from packuv.scene.header import digest
+from packuv.scene.header import codes_digest
 
 FORMAT, VERSION, ATTACHMENT = "packuv-atlas", 1, "atlas.json"
 EXACT_ALWAYS = (POSITION_HI, POSITION_LO)
@@ -220,7 +220,7 @@ def _plan(scene: Scene, options: AtlasVideoOptions, progress: Callable[[int], No
         for frame in range(seating.first, seating.first + seating.frames):
             codes = scene.codes(frame)
             rows = seating.visible(codes)
-            digests.append(digest(codes[rows]))
+            digests.append(codes_digest(codes[rows]))
             drawn, seated = drawn + int((codes.attributes[:, OPACITY] > 0).sum()), seated + len(rows)
             progress(len(digests))
     crop = _Crop(*(np.array(sorted(numbers), np.int64) for numbers in used))

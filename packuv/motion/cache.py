@@ -55,7 +55,7 @@ def measure_motion(
     step. `progress` gets the picture count done and in all. Raises ValueError if the folder holds another measurement.
     """
     _claim(folder, _recipe(views, options))
-    todo = [_Track(folder, views.cameras[index], len(views), options) for index in range(len(views.cameras))]
+    todo = [_CameraFiles(folder, views.cameras[index], len(views), options) for index in range(len(views.cameras))]
     tally = _Tally(len(views) * len(todo), progress)
     with _one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
         jobs = [pool.submit(_measure_camera, views, index, todo[index], options, tally) for index in range(len(todo))]
@@ -91,25 +91,25 @@ def _one_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _measure_camera(views: Views, camera: int, track: _Track, options: MotionOptions, tally: _Tally) -> None:
+def _measure_camera(views: Views, camera: int, files: _CameraFiles, options: MotionOptions, tally: _Tally) -> None:
     available = np.flatnonzero(views.frames[:, camera] >= 0)
-    start = track.finished
+    start = files.finished
     tally.add(start)
     earlier = available[available < start]
     previous = int(earlier[-1]) if len(earlier) else NO_STEP
     before = grey(_pixels(views, camera, previous)) if previous >= 0 and start < len(views) else None
     for instant in range(start, len(views)):
         if views.frames[instant, camera] < 0:
-            track.skip(instant)
+            files.skip(instant)
         else:
             after = grey(_pixels(views, camera, instant))
             if before is None:
-                track.skip(instant)
+                files.skip(instant)
             else:
-                track.write(instant, previous, measure_step(before, after, options))
+                files.write(instant, previous, measure_step(before, after, options))
             before, previous = after, instant
         tally.add(1)
-    track.commit()
+    files.commit()
 
 
 def _pixels(views: Views, camera: int, instant: int) -> np.ndarray:
@@ -144,7 +144,7 @@ def _claim(folder: Path, recipe: Mapping[str, Any]) -> None:
     write_json(path, recipe)
 
 
-class _Track:
+class _CameraFiles:
     """The files of one camera: steps (always), masks as bits, flow as float16."""
 
     def __init__(self, folder: Path, camera: PinholeCamera, instants: int, options: MotionOptions) -> None:

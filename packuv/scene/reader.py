@@ -17,7 +17,7 @@ from packuv.scene.matroska import Reader
 from packuv.scene.sharing import assemble
 from packuv.scene.stream import REPEAT, Playback, key_codes
 
-NO_ROWS = np.empty((0, 0), np.uint8)
+NO_RESIDUALS = np.empty((0, 0), np.uint8)
 
 
 def open_scene(path: Path, *, threads: int = 0) -> Scene:
@@ -79,6 +79,12 @@ class Scene:
         """The frame on display at a time on the capture's clock: the last one that is not later, or the first."""
         return max(0, bisect_right(self.header.times_ns, time_ns) - 1)
 
+    def segment_at(self, frame: int) -> int:
+        """Number of the segment that holds a frame. Raises IndexError outside the scene."""
+        if not 0 <= frame < len(self):
+            raise IndexError(f"frame {frame} of a scene with {len(self)} frames")
+        return bisect_right(self._starts, frame) - 1
+
     def codes(self, frame: int) -> Codes:
         """All Gaussians of a frame as integers, absent ones (opacity code 0) included; yours to change."""
         codes = self._seek(frame)
@@ -104,9 +110,7 @@ class Scene:
 
     def _seek(self, frame: int) -> Codes:
         """Bring the playback to a frame; on an error nothing half-done stays behind."""
-        if not 0 <= frame < len(self):
-            raise IndexError(f"frame {frame} of a scene with {len(self)} frames")
-        segment = bisect_right(self._starts, frame) - 1
+        segment = self.segment_at(frame)
         reading_on = frame == self._frame + 1
         horizon = len(self) - 1 if reading_on else frame
         try:
@@ -156,7 +160,7 @@ class Scene:
         assert self._playback is not None
         entry, step = self.index.segments[self._segment], self._frame + 1 - self._starts[self._segment]
         prediction, differences = entry.predictions[step - 1], bool(entry.differences[step - 1])
-        rows = NO_ROWS
+        rows = NO_RESIDUALS
         if prediction != REPEAT:
             picture, track = self._next_picture(self._segment, step, horizon), self.index.tracks[DYNAMIC]
             count = self._playback.toggle(track.mosaic.read_flags(picture, entry.dynamic))
@@ -198,11 +202,3 @@ def _read_index(path: Path, reader: Reader) -> SceneIndex:
     if reader.tracks[: len(expected)] != expected:
         raise ValueError(f"{path} must have the video tracks {expected}, but has {reader.tracks}")
     return index
-
-
-def segment_of(scene: Scene, frame: int) -> int:
-    """Number of the segment that holds a frame."""
-    for number, entry in enumerate(scene.index.segments):
-        if entry.first <= frame < entry.first + entry.frames:
-            return number
-    raise IndexError(f"frame {frame} of a scene with {len(scene)} frames")

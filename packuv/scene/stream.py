@@ -36,9 +36,6 @@ def channel_names(sh_degree: int) -> tuple[str, ...]:
     return (*fixed, "rotation_x", "rotation_y", "rotation_z", "opacity", *sh)
 
 
-# Absent rows
-
-
 # The key frame
 
 

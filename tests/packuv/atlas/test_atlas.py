@@ -30,7 +30,7 @@ from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, att
 from packuv.gaussians.segment import Segment
 from packuv.gaussians.uvmap import UvOptions, atlas_size
 from packuv.scene import SceneHeader, open_scene, write_scene
-from packuv.scene.header import digest
+from packuv.scene.header import codes_digest
 
 MAP = UvOptions(rows=64, columns=64, layers=4)
 
@@ -182,7 +182,7 @@ def test_every_codec_gives_back_the_very_integers(scene_path, tmp_path, codec):
             truth = scene.codes(frame)
             truth = truth[truth.attributes[:, OPACITY] > 0]
             assert as_set(codes) == as_set(truth)
-            assert digest(codes) == video.digests[frame]
+            assert codes_digest(codes) == video.digests[frame]
         assert video.header.to_json() == scene.header.to_json()
 
 

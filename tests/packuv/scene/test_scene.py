@@ -23,7 +23,7 @@ from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.scene import EncodeOptions, SceneHeader, VerifyReport, open_scene, verify_scene, write_scene
 from packuv.scene.encoder import TOLERANCES, Quality
-from packuv.scene.header import digest
+from packuv.scene.header import codes_digest
 from packuv.scene.lookahead import Address
 from packuv.scene.matroska import Packet, write_matroska
 from packuv.scene.sharing import KeyPlanner, stored_segments
@@ -134,7 +134,7 @@ def test_every_frame_comes_back_in_any_order(tmp_path, seed, shapes, degree):
     summary = write_scene(tmp_path / "scene.mkv", save(tmp_path, segments), header, threads=1)
     assert summary.frames == len(frames)
     assert summary.bytes == (tmp_path / "scene.mkv").stat().st_size > sum(summary.track_bytes.values())
-    assert list(summary.digests) == [digest(codes) for codes in frames]
+    assert list(summary.digests) == [codes_digest(codes) for codes in frames]
     with open_scene(tmp_path / "scene.mkv", threads=1) as scene:
         assert len(scene) == len(frames)
         for frame in [*range(len(frames)), *np.random.default_rng(seed).integers(0, len(frames), 6).tolist()]:
@@ -409,9 +409,11 @@ def test_nothing_but_the_scene_is_left_behind(tmp_path):
 def test_progress_counts_every_frame_twice(tmp_path):
     steps = []
     segments = save(tmp_path, random_sequence(1, [(5, 5, 3), (5, 0, 2)]))
-    write_scene(
-        tmp_path / "scene.mkv", segments, make_header(5), progress=lambda done, total: steps.append((done, total))
-    )
+
+    def progress(done, total, note=""):
+        steps.append((done, total))
+
+    write_scene(tmp_path / "scene.mkv", segments, make_header(5), progress=progress)
     assert steps == [(done, 10) for done in range(1, 11)]
 
 
