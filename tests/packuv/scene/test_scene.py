@@ -574,7 +574,8 @@ def rewritten(scene_file, tmp_path, change):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b'"version":2', b'"version":7', "it is packuv-scene version 7, layout compact; this program reads"),
+        (b'"version":2', b'"version":1', "it is packuv-scene version 1, layout compact; this program reads"),
+        (b'"version":2', b'"version":3', "it is packuv-scene version 3, layout compact; this program reads"),
         (b'"layout":"compact"', b'"layout":"compacT"', "layout compacT"),
         (b'"rows":300', b'"roWs":300', "lacks or misuses a field"),
         (b'"rows":300', b'"rows":1e9', "segment at frame 0 does not fit"),
