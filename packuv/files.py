@@ -22,7 +22,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Arrays by name, not compressed."""
     with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez(file, **dict(arrays))  # type: ignore[arg-type]
+        np.savez(file, **arrays)  # type: ignore[arg-type]  # its stub takes them for allow_pickle
 
 
 @contextmanager

@@ -109,7 +109,8 @@ def draw_triplets(codes: Codes, seating: Seating, *, sh_degree: int, options: Uv
 
 def filled(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
     """Texels that hold a Gaussian, bool [height, width]."""
-    return (pictures[POSITION_HI] | pictures[POSITION_LO]).any(axis=2)
+    texels: np.ndarray = (pictures[POSITION_HI] | pictures[POSITION_LO]).any(axis=2)
+    return texels
 
 
 def read_triplets(pictures: Mapping[str, np.ndarray], *, sh_degree: int) -> Codes:
@@ -155,7 +156,7 @@ def _as_seen(pictures: Mapping[str, np.ndarray], quantizer: Quantizer) -> np.nda
     """The base colours on screen, black where no Gaussian is."""
     values = np.stack([quantizer.attribute_table[DC][k][pictures["colour"][..., k]] for k in range(3)], axis=-1)
     shown = np.rint(np.clip(0.5 + SH_C0 * values, 0, 1) * 255).astype(np.uint8)
-    return shown * filled(pictures)[..., None]
+    return np.where(filled(pictures)[..., None], shown, 0)
 
 
 def _tiled(pictures: Mapping[str, np.ndarray]) -> np.ndarray:

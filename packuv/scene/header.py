@@ -69,7 +69,8 @@ class SceneHeader:
     @property
     def times_ms(self) -> np.ndarray:
         """Presentation times in the file, int64 [T]: milliseconds after the first frame."""
-        return (self.times_ns - self.times_ns[:1] + 500_000) // 1_000_000
+        milliseconds: np.ndarray = (self.times_ns - self.times_ns[:1] + 500_000) // 1_000_000
+        return milliseconds
 
     def first(self, frames: int) -> SceneHeader:
         """The header of a scene that ends after so many frames."""

@@ -153,7 +153,7 @@ def write_matroska(
             container.mux(_muxable(packet, streams[packet.track]))
 
 
-def _muxable(packet: Packet, stream: Any) -> av.Packet:
+def _muxable(packet: Packet, stream: Any) -> av.Packet[Any]:
     out = av.Packet(packet.data)
     out.stream, out.time_base = stream, TIME_BASE
     out.pts = out.dts = packet.time_ms
@@ -198,7 +198,7 @@ class Reader:
                 self._container.close()
                 raise ValueError(f"{path}: video track {number} must be FFV1; the file is damaged or no scene")
         self._extradata = [stream.codec_context.extradata for stream in self._container.streams.video]
-        self._packets: Iterator[av.Packet] = self._container.demux(*self._container.streams.video)
+        self._packets: Iterator[av.Packet[Any]] = self._container.demux(*self._container.streams.video)
 
     def decoder(self, number: int, track: VideoTrack) -> Decoder:
         """A new decoder for a track of the file; decoders may work at the same time, each on one thread."""

@@ -212,7 +212,7 @@ def read_deltas(folder: Path) -> Iterator[Codes]:
 def read_index(folder: Path) -> dict[str, Any]:
     """index.json of a folder for the web; raises FileNotFoundError, or ValueError for another one."""
     try:
-        index = json.loads((folder / INDEX).read_text())
+        index: dict[str, Any] = json.loads((folder / INDEX).read_text())
         known = (index["format"], index["version"]) == (FORMAT, VERSION)
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{folder / INDEX} is no index of a scene: {error!r}") from None

@@ -85,7 +85,8 @@ class Sheet:
         y, x = np.divmod(row % TILE**2, TILE)
         plane_y, plane_x = np.divmod(plane, self.across)
         top = plane_y * self.tiles_down * TILE + tile_y * TILE + y
-        return top * self.width + plane_x * self.tiles_across * TILE + tile_x * TILE + x
+        cells: np.ndarray = top * self.width + plane_x * self.tiles_across * TILE + tile_x * TILE + x
+        return cells
 
     def draw(self, rows: np.ndarray) -> np.ndarray:
         """The picture, uint8 [height, width], of byte planes [planes, n]; all else is 128."""
@@ -95,7 +96,7 @@ class Sheet:
 
     def read(self, picture: np.ndarray, count: int) -> np.ndarray:
         """Byte planes uint8 [planes, count] of a picture."""
-        return picture.reshape(-1)[self.cells(count)]
+        return picture.reshape(-1).take(self.cells(count))
 
     def to_json(self) -> dict[str, int]:
         return {**vars(self), "tile": TILE, "across": self.across, "width": self.width, "height": self.height}

@@ -48,8 +48,11 @@ def test_equal_codes_pair_off_like_their_naive_twin(counts, seed):
     found = equal_codes(codes, others)
     free = list(range(len(others)))
     for row in range(len(codes)):
-        same = [k for k in free if (others.xyz[k] == codes.xyz[row]).all()
-                and (others.attributes[k] == codes.attributes[row]).all()]  # fmt: skip
+        same = [
+            k
+            for k in free
+            if (others.xyz[k] == codes.xyz[row]).all() and (others.attributes[k] == codes.attributes[row]).all()
+        ]
         assert found[row] == (same[0] if same else -1)
         if same:
             free.remove(same[0])

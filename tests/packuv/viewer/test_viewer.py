@@ -279,10 +279,20 @@ def test_scene_json_names_frames_and_cameras() -> None:
 @pytest.mark.parametrize(
     "path",
     [
-        "/frames/8.bin", "/segments/3.bin", "/frames/-1.bin", "/frames/01.bin", "/frames/99999999999.bin", "/frames/0",
-        "/server.py", "/../server.py", "/%2e%2e/server.py", "//etc/passwd", "/page.html", "/nothing",
+        "/frames/8.bin",
+        "/segments/3.bin",
+        "/frames/-1.bin",
+        "/frames/01.bin",
+        "/frames/99999999999.bin",
+        "/frames/0",
+        "/server.py",
+        "/../server.py",
+        "/%2e%2e/server.py",
+        "//etc/passwd",
+        "/page.html",
+        "/nothing",
     ],
-)  # fmt: skip
+)
 def test_bad_paths_are_not_found(path: str) -> None:
     with running(make_source()) as server:
         answer, body = fetch(server, path)
