@@ -45,7 +45,7 @@ def fit_segment(
     ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
     for instant in instants[1 + len(track.frames) :]:
         masks = [motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras]
-        flows = [motion.flow(motion.names.index(camera.name), instant) for camera in views.cameras]
+        flows = [motion.optical_flow(motion.names.index(camera.name), instant) for camera in views.cameras]
         track.add(_fit_frame(track.model, key, views, instant, masks, flows, options))
         track.checkpoint()
         ticks.advance()

@@ -39,7 +39,7 @@ class KeyframeOptions:
     camera: str | None = None
     """Take M(t) from this camera, as the paper does; None: the median over all"""
     smoothing: int = 5
-    """Width of the running mean before peaks are sought: two methods of flow agree on few of the raw peaks"""
+    """Width of the running mean before peaks are sought: two methods of optical flow agree on few of the raw peaks"""
     separation: int = 30
     """Least distance between keyframes (the paper's theta)"""
     max_segment: int = 60
