@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from packuv.files import write_npz
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.progress import Progress, no_progress
 
 

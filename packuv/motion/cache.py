@@ -25,7 +25,7 @@ import numpy as np
 
 from packuv.camera import PinholeCamera
 from packuv.files import write_json
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.motion.step import MotionOptions, Step, fitted_size, grey, grown, measure_step, options_from_json
 from packuv.progress import Progress, no_progress
 

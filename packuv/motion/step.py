@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from packuv.footage.views import Views
+from packuv.footage import Views
 
 
 class MotionBackend(StrEnum):
