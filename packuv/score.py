@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from packuv.camera import PinholeCamera
 from packuv.files import write_json
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
 from packuv.metrics import psnr, ssim
 from packuv.progress import Progress

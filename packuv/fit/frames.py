@@ -17,11 +17,11 @@ from packuv.fit.options import FitOptions
 from packuv.fit.shots import find_shots, moving_rows
 from packuv.fit.solver import Solver, tiled
 from packuv.fit.start.first import empty_gaussians
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity
 from packuv.gaussians.segment import Segment
-from packuv.motion.cache import MotionCache
+from packuv.motion import MotionCache
 from packuv.progress import Progress, Ticks, no_progress
 
 

@@ -29,10 +29,10 @@ from packuv.fit.start.first import first_gaussians, neighbour_distance, round_ga
 from packuv.fit.start.hull import hull_points, in_hull
 from packuv.fit.start.points import Points, drawn, no_points
 from packuv.fit.start.shell import Shell, sweep_shell
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY_RANGE, Quantizer, attribute_values
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, canonical
-from packuv.motion.background import Still
+from packuv.motion import Still
 from packuv.motion.step import MotionOptions, difference
 from packuv.progress import Progress, Ticks, no_progress
 from packuv.raster import RasterOptions, Workspace, render

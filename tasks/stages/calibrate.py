@@ -18,7 +18,7 @@ from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
 from packuv.files import write_json
-from packuv.footage.reader import FrameReader
+from packuv.footage import FrameReader
 from packuv.progress import Progress
 from sync.align import FrameGroups
 from sync.capture import Capture, find_capture

@@ -16,9 +16,8 @@ from packuv.footage.lens import undistorted_camera
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.segment import Segment
 from packuv.progress import Progress
-from packuv.scene import EncodeOptions, SceneHeader, open_scene, write_scene
+from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
 from packuv.scene.sharing import stored_segments
-from packuv.scene.stream import Tolerance
 from sync.align import SyncReport
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop

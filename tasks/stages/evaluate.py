@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from packuv.files import write_json
-from packuv.footage.lens import LensCamera
-from packuv.footage.views import Views
+from packuv.footage import LensCamera, Views
 from packuv.progress import Progress
 from packuv.scene import open_scene
 from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table

@@ -18,13 +18,19 @@ from packuv.fit.keyframe import KeyState
 from packuv.fit.options import FitOptions
 from packuv.fit.seam import seam, tail
 from packuv.fit.start.points import Points
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.rows import hold_absent
 from packuv.gaussians.segment import Segment
-from packuv.motion.background import BackgroundOptions, Still, load_stills, save_stills
-from packuv.motion.background import find_background as measure_background
-from packuv.motion.cache import MotionCache
-from packuv.motion.step import MotionOptions, changed_between
+from packuv.motion import (
+    BackgroundOptions,
+    MotionCache,
+    MotionOptions,
+    Still,
+    changed_between,
+    load_stills,
+    save_stills,
+)
+from packuv.motion import find_background as measure_background
 from packuv.progress import Progress
 from sync.align import FrameGroups
 from tasks.artefacts.store import Key

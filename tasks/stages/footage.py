@@ -10,8 +10,7 @@ import numpy as np
 
 from calibration.rig import Camera, Rig
 from packuv.camera import PinholeCamera
-from packuv.footage.lens import LensCamera
-from packuv.footage.views import Views
+from packuv.footage import LensCamera, Views
 from sync.align import FrameGroups
 from sync.capture import find_capture
 from tasks.artefacts.store import Key

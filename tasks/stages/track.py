@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from packuv.files import write_json
-from packuv.motion.cache import MotionCache, measure_motion
+from packuv.motion import MotionCache, MotionOptions, measure_motion
 from packuv.motion.keyframes import KeyframeOptions, motion_curve, segments
 from packuv.motion.keyframes import choose_keyframes as choose
-from packuv.motion.step import MotionOptions
 from packuv.progress import Progress
 from tasks.artefacts.recipe import digest
 from tasks.artefacts.store import Key

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from packuv.atlas import import_atlas
 from packuv.atlas.picture import (
     CAPTION,
     SHEET_GAP,
@@ -24,7 +25,6 @@ from packuv.atlas.picture import (
     triplet_names,
     write_png,
 )
-from packuv.atlas.restore import import_atlas
 from packuv.atlas.video import ATTACHMENT, EXACT_ALWAYS, AtlasCodec, AtlasVideo, AtlasVideoOptions, export_atlas
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment

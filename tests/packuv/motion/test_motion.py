@@ -19,9 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
-from packuv.footage.lens import LensCamera
-from packuv.footage.views import Views
-from packuv.motion.cache import MotionCache, measure_motion
+from packuv.footage import LensCamera, Views
+from packuv.motion import MotionCache, measure_motion
 from packuv.motion.step import (
     Evidence,
     MotionOptions,
@@ -257,9 +256,9 @@ def test_workers_do_not_change_a_byte(views: Views, cache: MotionCache, tmp_path
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from packuv.footage.views import Views
-from packuv.motion.cache import measure_motion
-from packuv.motion.step import MotionOptions
+from packuv.footage import Views
+from packuv.motion import measure_motion
+from packuv.motion import MotionOptions
 import json
 def die(done, total):
     if done == int(sys.argv[3]):

@@ -21,13 +21,21 @@ import packuv
 from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
-from packuv.scene import EncodeOptions, SceneHeader, VerifyReport, open_scene, verify_scene, write_scene
-from packuv.scene.encoder import TOLERANCES, Quality
+from packuv.scene import (
+    TOLERANCES,
+    EncodeOptions,
+    Quality,
+    SceneHeader,
+    Tolerance,
+    VerifyReport,
+    open_scene,
+    verify_scene,
+    write_scene,
+)
 from packuv.scene.header import codes_digest
 from packuv.scene.lookahead import Address
 from packuv.scene.matroska import Packet, write_matroska
 from packuv.scene.sharing import KeyPlanner, stored_segments
-from packuv.scene.stream import Tolerance
 from tests.support.places import ROOT
 
 DOCUMENT = ROOT / "docs/scene-format.md"
