@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.files import write_json, write_npz
+from packuv.files import save_json, save_npz
 from packuv.fit.keyframe import DEAD_CODE, KeyState
 from packuv.fit.lift import lift_motion
 from packuv.fit.model import Model
@@ -118,10 +118,10 @@ class Track:
         """Everything a later call needs. The list of frames is written last and decides what counts."""
         count = len(self.frames)
         codes = self.frames[-1]
-        write_npz(self._scratch / f"frame_{count:06d}.npz", {"xyz": codes.xyz, "attributes": codes.attributes})
+        save_npz(self._scratch / f"frame_{count:06d}.npz", {"xyz": codes.xyz, "attributes": codes.attributes})
         state = {name: getattr(self.model.gaussians, name) for name in ATTRIBUTES}
-        write_npz(self._scratch / f"state_{count:06d}.npz", {**state, "changed": self._changed})
-        write_json(self._scratch / "track.json", {"figures": self.figures})
+        save_npz(self._scratch / f"state_{count:06d}.npz", {**state, "changed": self._changed})
+        save_json(self._scratch / "track.json", {"figures": self.figures})
         (self._scratch / f"state_{count - 1:06d}.npz").unlink(missing_ok=True)
 
     def segment(self) -> Segment:

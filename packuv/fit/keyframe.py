@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.files import write_json, write_npz
+from packuv.files import save_json, save_npz
 from packuv.fit.losses import photometric_loss
 from packuv.fit.model import Model
 from packuv.fit.options import FitOptions
@@ -58,9 +58,9 @@ class KeyState:
 
     def save(self, folder: Path) -> None:
         """Write state.npz and key.json."""
-        write_npz(folder / "state.npz", {name: getattr(self.gaussians, name) for name in ATTRIBUTES})
+        save_npz(folder / "state.npz", {name: getattr(self.gaussians, name) for name in ATTRIBUTES})
         bounds = {"centre": self.bounds.centre.tolist(), "radius": self.bounds.radius, "near": self.bounds.near}
-        write_json(folder / "key.json", {"instant": self.instant, "quantizer": self.quantizer.to_json(),
+        save_json(folder / "key.json", {"instant": self.instant, "quantizer": self.quantizer.to_json(),
                                          "bounds": bounds, "figures": dict(self.figures)})  # fmt: skip
 
     @classmethod

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.files import write_json
+from packuv.files import save_json
 from packuv.footage import Views
 from packuv.motion.step import MotionOptions, Step, fitted_size, grey, grown, measure_step, options_from_json
 from packuv.progress import Progress, no_progress
@@ -141,7 +141,7 @@ def _claim(folder: Path, recipe: Mapping[str, Any]) -> None:
         if differing := sorted(key for key in {*found, *recipe} if found.get(key) != recipe.get(key)):
             raise ValueError(f"{folder} holds a motion measurement with other {', '.join(differing)}; delete it first")
         return
-    write_json(path, recipe)
+    save_json(path, recipe)
 
 
 class _CameraFiles:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from packuv.files import write_json
+from packuv.files import save_json
 from packuv.fit.keyframe import KeyState
 from packuv.footage.lens import undistorted_camera
 from packuv.gaussians.codes import OPACITY, Codes
@@ -130,7 +130,7 @@ def build_scene(
         progress=progress,
     )
     notes = {"frames": summary.frames, "bytes": summary.bytes, "track_bytes": dict(summary.track_bytes)}
-    write_json(out / "encode.json", notes)
+    save_json(out / "encode.json", notes)
     return notes
 
 
@@ -178,7 +178,7 @@ def build_verification(scene: Path, segments: list[Path], out: Path, progress: P
         if frame != len(opened):
             raise RuntimeError(f"{scene} has {len(opened)} frames, but {frame} were fitted")
     notes = {"frames": frame, "exact": worst.exact, "largest_error": vars(worst)}
-    write_json(out / "verify.json", notes)
+    save_json(out / "verify.json", notes)
     return notes
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from packuv.files import write_json
+from packuv.files import save_json
 from packuv.footage import LensCamera, Views
 from packuv.progress import Progress
 from packuv.scene import open_scene
@@ -73,7 +73,7 @@ def build(footage: Footage, scene: Path, options: EvaluateOptions, out: Path, pr
         write_table(out / TABLE, scores)
         write_pictures(out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
         facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
-    write_json(out / METRICS, facts)
+    save_json(out / METRICS, facts)
     return {name: facts[name] for name in ("cameras", "held_out", "mean")}
 
 

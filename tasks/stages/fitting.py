@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calibration.triangulate import SparsePoints
-from packuv.files import write_json
+from packuv.files import save_json
 from packuv.fit import frames, keyframe
 from packuv.fit.keyframe import KeyState
 from packuv.fit.options import FitOptions
@@ -293,7 +293,7 @@ def build_segment(
         progress=progress,
     )
     hold_absent(segment).save(out / SEGMENT)
-    write_json(out / FIGURES, {"frames": figures})
+    save_json(out / FIGURES, {"frames": figures})
     return {"frames": len(segment), "gaussians": len(segment.key), "dynamic": int(segment.dynamic.sum())}
 
 
@@ -301,7 +301,7 @@ def build_seam(footage: Footage, key: Path, segment: Path, after: Path, out: Pat
     """The job behind `measure_seam`."""
     found = seam(KeyState.load(key), Segment.load(segment), KeyState.load(after), footage.open_views())
     facts = {"ratio": found if math.isfinite(found) else None}
-    write_json(out / SEAM, facts)
+    save_json(out / SEAM, facts)
     return facts
 
 
@@ -311,7 +311,7 @@ def build_cut(segment: Path, frames: int, out: Path) -> dict[str, Any]:
     part = replace(whole, xyz=whole.xyz[: frames - 1], attributes=whole.attributes[: frames - 1])
     part.save(out / SEGMENT)
     figures = json.loads((segment / FIGURES).read_text())["frames"][: frames - 1]
-    write_json(out / FIGURES, {"frames": figures})
+    save_json(out / FIGURES, {"frames": figures})
     return {"frames": frames, "gaussians": len(part.key), "dynamic": int(part.dynamic.sum())}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from packuv.files import write_json
+from packuv.files import save_json
 from packuv.motion import MotionCache, MotionOptions, measure_motion
 from packuv.motion.keyframes import KeyframeOptions, motion_curve, segments
 from packuv.motion.keyframes import choose_keyframes as choose
@@ -78,7 +78,7 @@ def build_keyframes(motion: Path, options: KeyframeOptions, out: Path) -> dict[s
     keyframes = choose(curve, options)
     spans = segments(keyframes, len(curve))
     moving = np.nan_to_num(_shares(cache)).max(axis=1) > 0  # [T]
-    write_json(
+    save_json(
         out / KEYFRAMES,
         {
             "keyframes": [{"instant": item.instant, "reason": str(item.reason)} for item in keyframes],
