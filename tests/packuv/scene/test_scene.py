@@ -149,6 +149,15 @@ def test_every_frame_comes_back_in_any_order(tmp_path, seed, shapes, degree):
             assert same(scene.codes(frame), frames[frame])
 
 
+def test_every_frame_is_in_the_segment_that_says_so(scene_file):
+    lengths = [frames for _, _, frames in SHAPES]
+    with open_scene(scene_file[0]) as scene:
+        assert [scene.segment_at(frame) for frame in range(21)] == np.repeat(np.arange(6), lengths).tolist()
+        for outside in (-1, 21):
+            with pytest.raises(IndexError, match="of a scene with 21 frames"):
+                scene.segment_at(outside)
+
+
 def test_constant_channels_and_a_still_scene_take_no_space(tmp_path):
     key = Codes(np.full((500, 3), 777, np.uint16), np.full((500, 10), 9, np.uint8))
     still = Segment(0, key, np.ones(500, bool), np.repeat(key.xyz[None], 4, 0), np.repeat(key.attributes[None], 4, 0))
