@@ -33,10 +33,9 @@ from bench.made_up import SequenceOptions, find_gaussians, make_sequence
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer
 from packuv.gaussians.segment import Segment
 from packuv.gaussians.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
-from packuv.scene import EncodeOptions, Scene, SceneHeader, open_scene, write_scene
-from packuv.scene.encoder import TOLERANCES, Quality
+from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, SceneHeader, open_scene, write_scene
 from packuv.scene.header import DYNAMIC, KEY
-from packuv.scene.matroska import Encoder, Track
+from packuv.scene.matroska import Encoder, VideoTrack
 from packuv.scene.stream import channel_names, key_rows
 from packuv.score import Artist, spread
 from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
@@ -143,7 +142,7 @@ def measure_plain_atlas(
     channels = len(channel_names(quantizer.sh_degree))
     across = int(np.ceil(np.sqrt(channels)))
     down = -(-channels // across)
-    encoder = Encoder(Track("atlas", width * across, height * down, across * down))
+    encoder = Encoder(VideoTrack("atlas", width * across, height * down, across * down))
     total, seconds = 0, 0.0
     sizes: list[int] = []
     rows: list[int] = []

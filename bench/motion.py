@@ -24,7 +24,7 @@ import av
 import cv2
 import numpy as np
 
-from packuv.motion.step import FlowPreset, MotionOptions, grown, measure_step, optical_flow
+from packuv.motion.step import DisPreset, MotionOptions, grown, measure_step, optical_flow
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def optical_flow_of(pair: Pair, options: MotionOptions) -> np.ndarray:
 def flow_rows(clip: list[Pair]) -> Iterator[dict]:
     """Time and endpoint error by flow width and DIS preset."""
     for width in (160, 240, 320, 480, 640):
-        for preset in FlowPreset:
+        for preset in DisPreset:
             options = MotionOptions(width=max(width, 640), flow_width=width, preset=preset)
             flows = [optical_flow_of(pair, options) for pair in clip]
             errors = [distance(flow, pair.flow) for flow, pair in zip(flows, clip, strict=True)]

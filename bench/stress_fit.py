@@ -34,13 +34,10 @@ from packuv.fit.shots import Shot
 from packuv.fit.solver import Solver
 from packuv.fit.start.bounds import Bounds, find_bounds
 from packuv.fit.start.first import StartOptions, round_gaussians
-from packuv.footage.lens import LensCamera
-from packuv.footage.views import Views
+from packuv.footage import LensCamera, Views
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians
 from packuv.metrics import psnr
-from packuv.motion.background import Still, find_background
-from packuv.motion.cache import MotionCache, measure_motion
-from packuv.motion.step import MotionOptions, changed_between
+from packuv.motion import MotionCache, MotionOptions, Still, changed_between, find_background, measure_motion
 from packuv.raster import RasterOptions, render
 
 WIDTH, HEIGHT = 96, 64

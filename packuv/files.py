@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
+def save_json(path: Path, data: Mapping[str, Any]) -> None:
     """Readable JSON, keys in the given order."""
     with whole_file(path) as partial:
         partial.write_text(json.dumps(data, indent=1))
 
 
-def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+def save_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Arrays by name, not compressed."""
     with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez(file, **dict(arrays))  # type: ignore[arg-type]
+        np.savez(file, **arrays)  # type: ignore[arg-type]  # its stub takes them for allow_pickle
 
 
 @contextmanager

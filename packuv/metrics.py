@@ -47,7 +47,8 @@ def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     variance_a, variance_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
     covariance = _blur(a * b) - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
-    return luminance * (2 * covariance + c2) / (variance_a + variance_b + c2)
+    similarity: np.ndarray = luminance * (2 * covariance + c2) / (variance_a + variance_b + c2)
+    return similarity
 
 
 def _blur(plane: np.ndarray) -> np.ndarray:

@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 
 from packuv.camera import PinholeCamera
-from packuv.files import write_json
-from packuv.footage.views import Views
+from packuv.files import save_json
+from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
 from packuv.metrics import psnr, ssim
 from packuv.progress import Progress
@@ -95,7 +95,7 @@ def write_pictures(folder: Path, scene: Scene, views: Views, chosen: Sequence[tu
         write_picture(folder / names["render"], artist.draw(scene.gaussians(frame), views.cameras[place]))
         write_picture(folder / names["truth"], truth)
         index.append({"camera": camera, "frame": frame, "choice": why, **names})
-    write_json(folder / "index.json", {"pictures": index})
+    save_json(folder / "index.json", {"pictures": index})
 
 
 class Artist:

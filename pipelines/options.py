@@ -7,10 +7,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from packuv.fit.options import FitOptions
-from packuv.motion.keyframes import KeyframeOptions
-from packuv.motion.step import MotionOptions
-from packuv.scene import EncodeOptions
-from packuv.scene.encoder import TOLERANCES, Quality
+from packuv.motion import KeyframeOptions, MotionOptions
+from packuv.scene import TOLERANCES, EncodeOptions, Quality
 from pipelines.request import PRESETS, QUALITIES
 from sync.align import AlignOptions
 from sync.capture import CaptureSettings

@@ -19,7 +19,6 @@ from packuv.gaussians.codes import DC, OPACITY, REST, ROTATION, SCALE, Codes, Qu
 from packuv.gaussians.floats import SH_C0
 from packuv.gaussians.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
 from packuv.scene import Scene
-from packuv.scene.reader import segment_of
 
 POSITION_HI, POSITION_LO, OPACITIES = "position_hi", "position_lo", "opacity"
 """Triplets that are not three columns of the attributes; the third holds opacity, 255 where dynamic, and 0."""
@@ -110,7 +109,8 @@ def draw_triplets(codes: Codes, seating: Seating, *, sh_degree: int, options: Uv
 
 def filled(pictures: Mapping[str, np.ndarray]) -> np.ndarray:
     """Texels that hold a Gaussian, bool [height, width]."""
-    return (pictures[POSITION_HI] | pictures[POSITION_LO]).any(axis=2)
+    texels: np.ndarray = (pictures[POSITION_HI] | pictures[POSITION_LO]).any(axis=2)
+    return texels
 
 
 def read_triplets(pictures: Mapping[str, np.ndarray], *, sh_degree: int) -> Codes:
@@ -136,8 +136,7 @@ def sheet(scene: Scene, frame: int, *, options: UvOptions, triplet: str | None =
     degree = scene.header.quantizer.sh_degree
     if triplet is not None and triplet not in triplet_names(degree):
         raise ValueError(f"the scene has the triplets {', '.join(triplet_names(degree))}, but not {triplet!r}")
-    number = segment_of(scene, frame)
-    seating, codes = seat(scene, number, options=options), scene.codes(frame)
+    seating, codes = seat(scene, scene.segment_at(frame), options=options), scene.codes(frame)
     pictures = draw_triplets(codes, seating, sh_degree=degree, options=options)
     if triplet is not None:
         return pictures[triplet]
@@ -157,7 +156,7 @@ def _as_seen(pictures: Mapping[str, np.ndarray], quantizer: Quantizer) -> np.nda
     """The base colours on screen, black where no Gaussian is."""
     values = np.stack([quantizer.attribute_table[DC][k][pictures["colour"][..., k]] for k in range(3)], axis=-1)
     shown = np.rint(np.clip(0.5 + SH_C0 * values, 0, 1) * 255).astype(np.uint8)
-    return shown * filled(pictures)[..., None]
+    return np.where(filled(pictures)[..., None], shown, 0)
 
 
 def _tiled(pictures: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -17,7 +17,7 @@ from packuv.gaussians.rows import segment_of
 from packuv.gaussians.segment import Segment
 from packuv.progress import Progress, no_progress, part_of
 from packuv.scene import write_scene
-from packuv.scene.header import digest
+from packuv.scene.header import codes_digest
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class _Tally:
     def add(self, codes: Codes, wanted: str) -> None:
         self.frames += 1
         self.gaussians += len(codes)
-        self.changed += digest(codes) != wanted
+        self.changed += codes_digest(codes) != wanted
 
 
 def _segments(video: AtlasVideo, tally: _Tally, progress: Callable[[int], None]) -> Iterator[Segment]:

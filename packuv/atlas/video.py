@@ -37,7 +37,7 @@ from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.uvmap import UvOptions
 from packuv.progress import Progress, no_progress
 from packuv.scene import Scene, SceneHeader, open_scene
-from packuv.scene.header import digest
+from packuv.scene.header import codes_digest
 
 FORMAT, VERSION, ATTACHMENT = "packuv-atlas", 1, "atlas.json"
 EXACT_ALWAYS = (POSITION_HI, POSITION_LO)
@@ -81,27 +81,41 @@ class _Coder:
 _X265 = "log-level=error:keyint=-1:scenecut=0"
 _CODERS = {
     AtlasCodec.FFV1: _Coder(
-        "ffv1", "bgr0",
-        {"level": "3", "coder": "1", "context": "0", "slices": "24", "slicecrc": "1", "g": "1"}, {},
+        "ffv1",
+        "bgr0",
+        {"level": "3", "coder": "1", "context": "0", "slices": "24", "slicecrc": "1", "g": "1"},
+        {},
     ),
     AtlasCodec.HUFFYUV: _Coder("huffyuv", "rgb24", {}, {}),
     AtlasCodec.X264: _Coder(
-        "libx264rgb", "bgr24", {"preset": "medium", "g": "10000", "sc_threshold": "0", "forced-idr": "1"},
-        {"qp": "0"}, lambda crf: {"crf": str(crf)},
+        "libx264rgb",
+        "bgr24",
+        {"preset": "medium", "g": "10000", "sc_threshold": "0", "forced-idr": "1"},
+        {"qp": "0"},
+        lambda crf: {"crf": str(crf)},
     ),
     AtlasCodec.X265: _Coder(
-        "libx265", "gbrp", {"preset": "fast", "forced-idr": "1"},
-        {"x265-params": f"{_X265}:lossless=1"}, lambda crf: {"crf": str(crf), "x265-params": _X265},
+        "libx265",
+        "gbrp",
+        {"preset": "fast", "forced-idr": "1"},
+        {"x265-params": f"{_X265}:lossless=1"},
+        lambda crf: {"crf": str(crf), "x265-params": _X265},
     ),
     AtlasCodec.VP9: _Coder(
-        "libvpx-vp9", "gbrp", {"deadline": "good", "cpu-used": "5", "row-mt": "1", "g": "10000"},
-        {"lossless": "1"}, lambda crf: {"crf": str(crf), "b": "0"},
+        "libvpx-vp9",
+        "gbrp",
+        {"deadline": "good", "cpu-used": "5", "row-mt": "1", "g": "10000"},
+        {"lossless": "1"},
+        lambda crf: {"crf": str(crf), "b": "0"},
     ),
     AtlasCodec.AV1: _Coder(
-        "libsvtav1", "yuv420p", {"preset": "8", "g": "10000"},
-        {"svtav1-params": "lossless=1:lp=2"}, lambda crf: {"crf": str(crf)},
+        "libsvtav1",
+        "yuv420p",
+        {"preset": "8", "g": "10000"},
+        {"svtav1-params": "lossless=1:lp=2"},
+        lambda crf: {"crf": str(crf)},
     ),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -220,7 +234,7 @@ def _plan(scene: Scene, options: AtlasVideoOptions, progress: Callable[[int], No
         for frame in range(seating.first, seating.first + seating.frames):
             codes = scene.codes(frame)
             rows = seating.visible(codes)
-            digests.append(digest(codes[rows]))
+            digests.append(codes_digest(codes[rows]))
             drawn, seated = drawn + int((codes.attributes[:, OPACITY] > 0).sum()), seated + len(rows)
             progress(len(digests))
     crop = _Crop(*(np.array(sorted(numbers), np.int64) for numbers in used))
@@ -271,9 +285,14 @@ def _encode(scene: Scene, plan: _Plan, path: Path, options: AtlasVideoOptions, p
 
 
 def _write_container(
-    path: Path, kind: str, document: bytes | None, scene: Scene, plan: _Plan, options: AtlasVideoOptions,
+    path: Path,
+    kind: str,
+    document: bytes | None,
+    scene: Scene,
+    plan: _Plan,
+    options: AtlasVideoOptions,
     progress: Callable[[int], None],
-) -> None:  # fmt: skip
+) -> None:
     coder, header = _CODERS[options.codec], scene.header
     os.environ.setdefault("SVT_LOG", "1")  # SVT-AV1 prints its settings for every track unless told to report errors
     # AVI counts frames and knows no times.
@@ -307,9 +326,14 @@ def _to_matroska(folder: Path, path: Path, names: Sequence[str]) -> None:
 
 
 def _stream(
-    container: Any, name: str, coder: _Coder, size: tuple[int, int], rate: Fraction, base: Fraction,
+    container: Any,
+    name: str,
+    coder: _Coder,
+    size: tuple[int, int],
+    rate: Fraction,
+    base: Fraction,
     options: AtlasVideoOptions,
-) -> Any:  # fmt: skip
+) -> Any:
     crf = None if name in EXACT_ALWAYS else options.crf
     stream = container.add_stream(coder.name, rate=rate, options=coder.options(crf))
     stream.height, stream.width = (3 * size[0], size[1]) if coder.stacked else size
@@ -405,6 +429,7 @@ class AtlasVideo:
 
     def _picture(self, frame: Any) -> np.ndarray:
         height, width = self._size
+        picture: np.ndarray
         if not self._stacked:
             picture = frame.to_ndarray(format="rgb24")
         else:

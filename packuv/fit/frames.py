@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from packuv.files import write_json, write_npz
+from packuv.files import save_json, save_npz
 from packuv.fit.keyframe import DEAD_CODE, KeyState
 from packuv.fit.lift import lift_motion
 from packuv.fit.model import Model
@@ -18,11 +18,11 @@ from packuv.fit.options import FrameOptions
 from packuv.fit.shots import find_shots, moving_rows
 from packuv.fit.solver import Solver, tiled
 from packuv.fit.start.first import empty_gaussians
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity
 from packuv.gaussians.segment import Segment
-from packuv.motion.cache import MotionCache
+from packuv.motion import MotionCache
 from packuv.progress import Progress, Ticks, no_progress
 
 
@@ -46,7 +46,7 @@ def fit_segment(
     ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
     for instant in instants[1 + len(track.frames) :]:
         masks = [motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras]
-        flows = [motion.flow(motion.names.index(camera.name), instant) for camera in views.cameras]
+        flows = [motion.optical_flow(motion.names.index(camera.name), instant) for camera in views.cameras]
         track.add(_fit_frame(track.model, key, views, instant, masks, flows, options))
         track.checkpoint()
         ticks.advance()
@@ -124,10 +124,10 @@ class Track:
         """Everything a later call needs. The list of frames is written last and decides what counts."""
         count = len(self.frames)
         codes = self.frames[-1]
-        write_npz(self._scratch / f"frame_{count:06d}.npz", {"xyz": codes.xyz, "attributes": codes.attributes})
+        save_npz(self._scratch / f"frame_{count:06d}.npz", {"xyz": codes.xyz, "attributes": codes.attributes})
         state = {name: getattr(self.model.gaussians, name) for name in ATTRIBUTES}
-        write_npz(self._scratch / f"state_{count:06d}.npz", {**state, "changed": self._changed})
-        write_json(self._scratch / "track.json", {"figures": self.figures})
+        save_npz(self._scratch / f"state_{count:06d}.npz", {**state, "changed": self._changed})
+        save_json(self._scratch / "track.json", {"figures": self.figures})
         (self._scratch / f"state_{count - 1:06d}.npz").unlink(missing_ok=True)
 
     def segment(self) -> Segment:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from packuv.files import write_json, write_npz
+from packuv.files import save_json, save_npz
 from packuv.fit.losses import photometric_loss
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
@@ -29,10 +29,10 @@ from packuv.fit.start.first import first_gaussians, neighbour_distance, round_ga
 from packuv.fit.start.hull import hull_points, in_hull
 from packuv.fit.start.points import Points, drawn, no_points
 from packuv.fit.start.shell import Shell, sweep_shell
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY_RANGE, Quantizer, attribute_values
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, canonical
-from packuv.motion.background import Still
+from packuv.motion import Still
 from packuv.motion.step import MotionOptions, difference
 from packuv.progress import Progress, Ticks, no_progress
 from packuv.raster import RasterOptions, Workspace, render
@@ -55,9 +55,9 @@ class KeyState:
 
     def save(self, folder: Path) -> None:
         """Write state.npz and key.json."""
-        write_npz(folder / "state.npz", {name: getattr(self.gaussians, name) for name in ATTRIBUTES})
+        save_npz(folder / "state.npz", {name: getattr(self.gaussians, name) for name in ATTRIBUTES})
         bounds = {"centre": self.bounds.centre.tolist(), "radius": self.bounds.radius, "near": self.bounds.near}
-        write_json(folder / "key.json", {"instant": self.instant, "quantizer": self.quantizer.to_json(),
+        save_json(folder / "key.json", {"instant": self.instant, "quantizer": self.quantizer.to_json(),
                                          "bounds": bounds, "figures": dict(self.figures)})  # fmt: skip
 
     @classmethod

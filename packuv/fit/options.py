@@ -17,7 +17,7 @@ from packuv.fit.model import Rates
 from packuv.fit.start.first import StartOptions
 from packuv.fit.start.shell import ShellOptions
 from packuv.gaussians.uvmap import UvOptions
-from packuv.motion.background import BackgroundOptions
+from packuv.motion import BackgroundOptions
 
 Part = TypeVar("Part", bound="SolverOptions")
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from packuv.fit.keyframe import DEAD_CODE, KeyState
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment

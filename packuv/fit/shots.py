@@ -13,7 +13,7 @@ from packuv.fit.depth import SparseDepth
 from packuv.fit.labels import dynamic_labels
 from packuv.fit.options import ChangeOptions
 from packuv.fit.start.bounds import Bounds
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import Gaussians
 

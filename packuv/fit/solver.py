@@ -15,7 +15,7 @@ from packuv.fit.options import FrameOptions, SolverOptions
 from packuv.fit.shots import Shot
 from packuv.fit.start.bounds import Bounds
 from packuv.fit.terms import Pull, Seen, pulls, summed
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity, rows_of
 from packuv.progress import Ticks

@@ -12,7 +12,7 @@ import av
 import numpy as np
 
 if TYPE_CHECKING:
-    from torchcodec.decoders import VideoDecoder
+    from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
 
 
 class FrameReader:
@@ -105,7 +105,8 @@ class FrameReader:
         with self._guard:
             decoder = self._decoders.pop(camera, None)
         if decoder is None:
-            from torchcodec.decoders import VideoDecoder  # takes seconds, and torch; many processes read no video
+            # Here, since it takes seconds, and torch; many processes read no video.
+            from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
 
             decoder = VideoDecoder(
                 str(self.videos[camera]), dimension_order="NHWC", num_ffmpeg_threads=self._threads, seek_mode="exact"

@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,9 +20,6 @@ import numpy as np
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera, gain_table, undistorted_camera, undistortion_maps
 from packuv.footage.reader import FrameReader
-
-if TYPE_CHECKING:
-    pass
 
 
 class Views:

@@ -143,10 +143,18 @@ def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress:
     pruned, finished = _compare(frames, out, options)
     drawn_count = survey.count - survey.undrawn
     return AdoptReport(
-        count, len(parts), summary.bytes, survey.count, survey.undrawn, drawn_count - mapper.kept,
-        mapper.kept / drawn_count, mapper.kept_alpha / mapper.alpha, header.quantizer.saturation(survey.first),
-        tuple(pruned), tuple(finished),
-    )  # fmt: skip
+        frames=count,
+        segments=len(parts),
+        bytes=summary.bytes,
+        gaussians=survey.count,
+        undrawn=survey.undrawn,
+        pruned=drawn_count - mapper.kept,
+        kept_share=mapper.kept / drawn_count,
+        kept_alpha_share=mapper.kept_alpha / mapper.alpha,
+        saturated=header.quantizer.saturation(survey.first),
+        psnr_pruned_db=tuple(pruned),
+        psnr_db=tuple(finished),
+    )
 
 
 def _header(survey: _Survey, frames: Sequence[Path], options: AdoptOptions) -> SceneHeader:
@@ -190,8 +198,10 @@ class _Survey:
         if not self.count:
             self.first, self._low, self._high, self._least, self._most = frame, low, high, least, most
         elif len(low) != len(self._low):
-            raise ValueError(f"{path} has SH of degree {frame.sh_degree}, the first file {self.first.sh_degree}; "
-                             "frames need one degree, choose it with --sh-degree")  # fmt: skip
+            raise ValueError(
+                f"{path} has SH of degree {frame.sh_degree}, the first file {self.first.sh_degree}; "
+                "frames need one degree, choose it with --sh-degree"
+            )
         self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
         self._least, self._most = np.minimum(self._least, least), np.maximum(self._most, most)
         self.count += len(frame) + undrawn

@@ -115,7 +115,8 @@ def _pack(share: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 def _pack_rotation(quaternions: np.ndarray) -> np.ndarray:
     """2 bits name the largest component of w x y z, 10 bits each hold the others in order."""
     largest, others = drop_largest(quaternions)
-    return largest.astype(np.uint32) << np.uint32(30) | _pack(others / math.sqrt(2) + 0.5, (10, 10, 10))
+    packed: np.ndarray = largest.astype(np.uint32) << np.uint32(30) | _pack(others / math.sqrt(2) + 0.5, (10, 10, 10))
+    return packed
 
 
 def _pack_bands(sh: np.ndarray) -> np.ndarray:
@@ -141,7 +142,8 @@ def _in_chunk(path: Path, chunk: np.ndarray, share: np.ndarray, names: tuple[str
     of_row = np.arange(len(share)) // CHUNK
     low = columns_of(path, chunk, [f"min_{name}" for name in names]).astype(np.float64)[of_row]
     high = columns_of(path, chunk, [f"max_{name}" for name in names]).astype(np.float64)[of_row]
-    return low * (1 - share) + high * share
+    values: np.ndarray = low * (1 - share) + high * share
+    return values
 
 
 def _unpack_rotation(packed: np.ndarray) -> np.ndarray:

@@ -25,9 +25,19 @@ PALETTE_ROW = 64
 """Palette entries in a row of the centroids' picture."""
 
 _DAMAGED = (
-    zipfile.BadZipFile, zlib.error, cv2.error, KeyError, TypeError, AttributeError, IndexError, OverflowError, EOFError,
-    RuntimeError, json.JSONDecodeError, UnicodeDecodeError,
-)  # fmt: skip
+    zipfile.BadZipFile,
+    zlib.error,
+    cv2.error,
+    KeyError,
+    TypeError,
+    AttributeError,
+    IndexError,
+    OverflowError,
+    EOFError,
+    RuntimeError,
+    json.JSONDecodeError,
+    UnicodeDecodeError,
+)
 """What the zip reader, the JSON reader, OpenCV and look-ups in a strange document raise."""
 
 _Pictures = Callable[[str], np.ndarray]
@@ -102,9 +112,14 @@ def _texels(name: str, content: bytes, count: int) -> np.ndarray:
 def _values(meta: Mapping[str, Any], codes: np.ndarray, columns: slice | int) -> np.ndarray:
     """Entries of the codebook, or shares of the range of the columns, float64."""
     if "codebook" in meta:
-        return np.asarray(meta["codebook"], np.float64)[codes]
+        return _entries(meta, codes)
     low, high = (np.asarray(meta[end], np.float64)[columns] for end in ("mins", "maxs"))
     return low + codes / 255 * (high - low)
+
+
+def _entries(meta: Mapping[str, Any], codes: np.ndarray) -> np.ndarray:
+    entries: np.ndarray = np.asarray(meta["codebook"], np.float64)[codes]
+    return entries
 
 
 def _positions(meta: Mapping[str, Any], texels: _Pictures) -> np.ndarray:
@@ -135,5 +150,7 @@ def _bands(meta: Mapping[str, Any], texels: _Pictures, read: Callable[[str], byt
         raise ValueError(f"{labels} points at palette entry {label.max()} of {len(palette)}")
     # Version 1 has one range for all coefficients.
     if "codebook" in meta:
-        return np.asarray(meta["codebook"], np.float64)[palette[label]]
-    return float(meta["mins"]) + palette[label] / 255 * (float(meta["maxs"]) - float(meta["mins"]))
+        return _entries(meta, palette[label])
+    low, high = float(meta["mins"]), float(meta["maxs"])
+    values: np.ndarray = low + palette[label] / 255 * (high - low)
+    return values

@@ -169,7 +169,8 @@ def _fractional_bits(means: np.ndarray) -> int:
 
 
 def _byte(values: np.ndarray) -> np.ndarray:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    codes: np.ndarray = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return codes
 
 
 def _pack_rotation(rotation: np.ndarray) -> np.ndarray:

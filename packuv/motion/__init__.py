@@ -1,1 +1,19 @@
 """What moves in the pictures: optical flow and masks, the background, keyframes."""
+
+from packuv.motion.background import BackgroundOptions, Still, find_background, load_stills, save_stills
+from packuv.motion.cache import MotionCache, measure_motion
+from packuv.motion.keyframes import KeyframeOptions
+from packuv.motion.step import MotionOptions, changed_between
+
+__all__ = [
+    "BackgroundOptions",
+    "KeyframeOptions",
+    "MotionCache",
+    "MotionOptions",
+    "Still",
+    "changed_between",
+    "find_background",
+    "load_stills",
+    "measure_motion",
+    "save_stills",
+]

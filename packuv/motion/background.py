@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.files import write_npz
-from packuv.footage.views import Views
+from packuv.files import save_npz
+from packuv.footage import Views
 from packuv.progress import Progress, no_progress
 
 
@@ -64,7 +64,7 @@ def find_background(views: Views, options: BackgroundOptions, progress: Progress
 def save_stills(path: Path, stills: Sequence[Still]) -> None:
     """Write one .npz with all backgrounds."""
     arrays = {f"{name}_{still.camera}": getattr(still, name) for still in stills for name in ("pixels", "known")}
-    write_npz(path, {"cameras": np.array([still.camera for still in stills], np.int64), **arrays})
+    save_npz(path, {"cameras": np.array([still.camera for still in stills], np.int64), **arrays})
 
 
 def load_stills(path: Path) -> list[Still]:

@@ -1,9 +1,9 @@
 """What moves: optical flow and motion masks between successive pictures of each camera (paper §4.2.2).
 
-The paper's mask is |flow| > tau, dilated. Flow alone bleeds from a moving outline far into a plain wall and misses
-slow parts (bench/motion.py measures both), so by default brightness that changes by more than the camera's own noise
-is the evidence, at the place that a thing leaves as well as where it arrives, and flow decides which outlines enclose
-something that moves.
+The paper's mask is |optical flow| > tau, dilated. That alone bleeds from a moving outline far into a plain wall and
+misses slow parts (bench/motion.py measures both), so by default brightness that changes by more than the camera's own
+noise is the evidence, at the place that a thing leaves as well as where it arrives, and optical flow decides which
+outlines enclose something that moves.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.files import write_json
-from packuv.footage.views import Views
+from packuv.files import save_json
+from packuv.footage import Views
 from packuv.motion.step import MotionOptions, Step, fitted_size, grey, grown, measure_step, options_from_json
 from packuv.progress import Progress, no_progress
 
@@ -55,7 +55,7 @@ def measure_motion(
     step. `progress` gets the picture count done and in all. Raises ValueError if the folder holds another measurement.
     """
     _claim(folder, _recipe(views, options))
-    todo = [_Track(folder, views.cameras[index], len(views), options) for index in range(len(views.cameras))]
+    todo = [_CameraFiles(folder, views.cameras[index], len(views), options) for index in range(len(views.cameras))]
     tally = _Tally(len(views) * len(todo), progress)
     with _one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
         jobs = [pool.submit(_measure_camera, views, index, todo[index], options, tally) for index in range(len(todo))]
@@ -91,25 +91,25 @@ def _one_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _measure_camera(views: Views, camera: int, track: _Track, options: MotionOptions, tally: _Tally) -> None:
+def _measure_camera(views: Views, camera: int, files: _CameraFiles, options: MotionOptions, tally: _Tally) -> None:
     available = np.flatnonzero(views.frames[:, camera] >= 0)
-    start = track.finished
+    start = files.finished
     tally.add(start)
     earlier = available[available < start]
     previous = int(earlier[-1]) if len(earlier) else NO_STEP
     before = grey(_pixels(views, camera, previous)) if previous >= 0 and start < len(views) else None
     for instant in range(start, len(views)):
         if views.frames[instant, camera] < 0:
-            track.skip(instant)
+            files.skip(instant)
         else:
             after = grey(_pixels(views, camera, instant))
             if before is None:
-                track.skip(instant)
+                files.skip(instant)
             else:
-                track.write(instant, previous, measure_step(before, after, options))
+                files.write(instant, previous, measure_step(before, after, options))
             before, previous = after, instant
         tally.add(1)
-    track.commit()
+    files.commit()
 
 
 def _pixels(views: Views, camera: int, instant: int) -> np.ndarray:
@@ -141,27 +141,27 @@ def _claim(folder: Path, recipe: Mapping[str, Any]) -> None:
         if differing := sorted(key for key in {*found, *recipe} if found.get(key) != recipe.get(key)):
             raise ValueError(f"{folder} holds a motion measurement with other {', '.join(differing)}; delete it first")
         return
-    write_json(path, recipe)
+    save_json(path, recipe)
 
 
-class _Track:
-    """The files of one camera: steps (always), masks as bits, flow as float16."""
+class _CameraFiles:
+    """The files of one camera: steps (always), masks as bits, optical flow as float16."""
 
     def __init__(self, folder: Path, camera: PinholeCamera, instants: int, options: MotionOptions) -> None:
         size = fitted_size(camera.width, camera.height, options.width)
-        flow = fitted_size(camera.width, camera.height, min(options.flow_width, options.width))
-        steps, masks, flows = _paths(folder, camera.name)
+        coarse = fitted_size(camera.width, camera.height, min(options.flow_width, options.width))
+        steps, masks, vectors = _paths(folder, camera.name)
         if not steps.exists():
             _new_array(masks, np.uint8, (instants, size[1], -(-size[0] // 8)))
             if options.keep_flow:
-                _new_array(flows, np.float16, (instants, flow[1], flow[0], 2))
+                _new_array(vectors, np.float16, (instants, coarse[1], coarse[0], 2))
             # Last, so that its presence says that the others are whole.
             empty = np.full(instants, np.array((UNFINISHED, np.nan, np.nan, np.nan), dtype=STEP_RECORD))
             np.save(steps.with_suffix(".scratch.npy"), empty)
             os.replace(steps.with_suffix(".scratch.npy"), steps)
         self._steps = np.lib.format.open_memmap(steps, mode="r+")
         self._masks = np.lib.format.open_memmap(masks, mode="r+")
-        self._flows = np.lib.format.open_memmap(flows, mode="r+") if options.keep_flow else None
+        self._vectors = np.lib.format.open_memmap(vectors, mode="r+") if options.keep_flow else None
         self._pending: dict[int, tuple[int, float, float, float]] = {}
 
     @property
@@ -175,8 +175,8 @@ class _Track:
 
     def write(self, instant: int, previous: int, step: Step) -> None:
         self._masks[instant] = np.packbits(step.mask, axis=1)
-        if self._flows is not None:
-            self._flows[instant] = step.flow
+        if self._vectors is not None:
+            self._vectors[instant] = step.optical_flow
         self._add(instant, (previous, step.magnitude, step.noise, float(step.mask.mean())))
 
     def _add(self, instant: int, record: tuple[int, float, float, float]) -> None:
@@ -186,8 +186,8 @@ class _Track:
 
     def commit(self) -> None:
         """Pictures reach the disk before the records that vouch for them."""
-        if self._flows is not None:
-            self._flows.flush()
+        if self._vectors is not None:
+            self._vectors.flush()
         self._masks.flush()
         for instant, record in self._pending.items():
             self._steps[instant] = record
@@ -242,14 +242,15 @@ class MotionCache:
 
     @property
     def magnitude(self) -> np.ndarray:
-        """float32 [T, C]: mean flow inside the mask over the whole picture, pixels per instant; NaN without a step.
+        """float32 [T, C]: mean |optical flow| in the mask over the picture, pixels an instant; NaN without a step.
 
         A step over dropped frames is divided by its length, so a drop is no peak.
         """
         length = np.arange(len(self))[:, None] - self.previous
-        return (self.steps["magnitude"] / length).astype(np.float32)
+        speed: np.ndarray = (self.steps["magnitude"] / length).astype(np.float32)
+        return speed
 
-    def flow(self, camera: int, instant: int) -> np.ndarray | None:
+    def optical_flow(self, camera: int, instant: int) -> np.ndarray | None:
         """Motion from the previous picture to this one on the previous one's grid: float32 [h, w, 2], full pixels.
 
         None where the camera has no step to this instant.
@@ -258,7 +259,8 @@ class MotionCache:
             return None
         if not self.options.keep_flow:
             raise ValueError(f"{self.folder} was measured without keep_flow; delete it and measure with it")
-        return self._arrays[camera][1][instant].astype(np.float32)
+        vectors: np.ndarray = self._arrays[camera][1][instant].astype(np.float32)
+        return vectors
 
     def mask(self, camera: int, instant: int, *, size: tuple[int, int] | None = None) -> np.ndarray | None:
         """What moved since the previous picture, dilated: bool [H, W], or None without a step to this instant.
@@ -288,10 +290,10 @@ class MotionCache:
 
     @cached_property
     def _arrays(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Memory maps per camera: masks uint8 [T, hm, ceil(wm / 8)], flow float16 [T, h, w, 2]."""
+        """Memory maps per camera: masks uint8 [T, hm, ceil(wm / 8)], optical flow float16 [T, h, w, 2]."""
         empty = np.empty((0, 0, 0, 2), dtype=np.float16)
         paths = [_paths(self.folder, name) for name in self.names]
         return [
-            (np.load(masks, mmap_mode="r"), np.load(flows, mmap_mode="r") if self.options.keep_flow else empty)
-            for _, masks, flows in paths
+            (np.load(masks, mmap_mode="r"), np.load(vectors, mmap_mode="r") if self.options.keep_flow else empty)
+            for _, masks, vectors in paths
         ]

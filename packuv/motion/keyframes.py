@@ -7,12 +7,12 @@ sees what that one does not.
 
 from __future__ import annotations
 
-from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from sortedcontainers import SortedList
 
 
 class Reason(StrEnum):
@@ -39,7 +39,7 @@ class KeyframeOptions:
     camera: str | None = None
     """Take M(t) from this camera, as the paper does; None: the median over all"""
     smoothing: int = 5
-    """Width of the running mean before peaks are sought: two methods of flow agree on few of the raw peaks"""
+    """Width of the running mean before peaks are sought: two methods of optical flow agree on few of the raw peaks"""
     separation: int = 30
     """Least distance between keyframes (the paper's theta)"""
     max_segment: int = 60
@@ -109,13 +109,13 @@ def choose_keyframes(curve: np.ndarray, options: KeyframeOptions) -> list[Keyfra
         raise ValueError(f"a motion curve must be finite, not negative and not empty, but is {curve.shape}: {curve}")
     if not curve.any():
         return [Keyframe(0, Reason.START)]
-    chosen = [0]
+    chosen = SortedList([0])
     for peak in _peaks(curve, options.prominence * curve.max()):
         if options.peaks is not None and len(chosen) > options.peaks:
             break
-        place = bisect(chosen, peak)
-        if all(abs(peak - other) >= options.separation for other in chosen[place - 1 : place + 1]):
-            chosen.insert(place, peak)
+        near = chosen.irange(peak - options.separation, peak + options.separation, inclusive=(False, False))
+        if next(near, None) is None:
+            chosen.add(peak)
     keyframes = [Keyframe(instant, Reason.PEAK if instant else Reason.START) for instant in chosen]
     splits = [Keyframe(instant, Reason.SPLIT) for instant in _splits(chosen, len(curve), options.max_segment)]
     return sorted([*keyframes, *splits], key=lambda keyframe: keyframe.instant)

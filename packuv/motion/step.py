@@ -10,17 +10,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from packuv.footage.views import Views
+from packuv.footage import Views
 
 
-class FlowBackend(StrEnum):
+class MotionBackend(StrEnum):
     """Who estimates optical flow."""
 
     DIS = "dis"
     """OpenCV's dense inverse search, on the CPU"""
 
 
-class FlowPreset(StrEnum):
+class DisPreset(StrEnum):
     """Effort of DIS."""
 
     ULTRAFAST = "ultrafast"
@@ -32,9 +32,9 @@ class Evidence(StrEnum):
     """What makes a pixel part of a motion mask."""
 
     CHANGE = "change"
-    """Brightness changes above the noise; flow fills what the changed outlines enclose"""
+    """Brightness changes above the noise; optical flow fills what the changed outlines enclose"""
     FLOW = "flow"
-    """The paper's |flow| > tau alone"""
+    """The paper's |optical flow| > tau alone"""
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class MotionOptions:
     evidence: Evidence = Evidence.CHANGE
     width: int = 640
     """Pictures are compared at most this wide, pixels; noise averages out in wider ones at no loss to a mask"""
-    backend: FlowBackend = FlowBackend.DIS
+    backend: MotionBackend = MotionBackend.DIS
     flow_width: int = 320
-    """Width at which flow is estimated and stored, pixels; never more than `width`"""
-    preset: FlowPreset = FlowPreset.MEDIUM
+    """Width at which optical flow is estimated and stored, pixels; never more than `width`"""
+    preset: DisPreset = DisPreset.MEDIUM
     """Medium at a width of 320 is as quick as fast at 640, as exact, and a quarter of the size"""
     tau_px: float = 0.5
-    """Flow from one picture to the next that counts as motion"""
+    """Optical flow from one picture to the next that counts as motion"""
     low_sigmas: float = 2.0
     """Change, in deviations of the noise, that belongs to a mask if connected to ..."""
     high_sigmas: float = 6.0
@@ -64,15 +64,15 @@ class MotionOptions:
     closing_px: int = 6
     """Gaps up to twice this in a changed outline are closed, pixels at `width`"""
     hole_share: float = 0.05
-    """Largest hole in an outline, share of the picture, that flow may fill: on plain walls and floors flow is chance"""
+    """Largest hole in an outline, share of the picture, that motion may fill: on plain walls and floors it is chance"""
     dilation_px: int = 3
     """Growth of a mask when it is read: the blur of its edges, plus a pixel of pose error"""
     keep_flow: bool = True
-    """Store flow: 0.23 MB a frame at 320x180. Off, 88 cameras for half an hour at 30 fps save a terabyte"""
+    """Store optical flow: 0.23 MB a frame at 320x180. Off, 88 cameras for half an hour at 30 fps save a terabyte"""
 
     def __post_init__(self) -> None:
         if self.width < 16 or self.flow_width < 16:
-            raise ValueError(f"pictures narrower than 16 px show no flow: {self.width=}, {self.flow_width=}")
+            raise ValueError(f"pictures narrower than 16 px show no motion: {self.width=}, {self.flow_width=}")
         if not 0 < self.low_sigmas <= self.high_sigmas or not self.noise_floor > 0 or not self.tau_px > 0:
             raise ValueError(
                 f"thresholds must satisfy 0 < low <= high and be positive: {self.low_sigmas=}, {self.high_sigmas=}, "
@@ -86,12 +86,12 @@ class MotionOptions:
 class Step:
     """Motion from one picture of a camera to a later one."""
 
-    flow: np.ndarray
+    optical_flow: np.ndarray
     """float32 [h, w, 2]: x and y motion of the earlier picture's content, in pixels of the full picture"""
     mask: np.ndarray
     """bool [hm, wm]: what moved, where it was and where it is; not dilated"""
     magnitude: float
-    """Mean over the picture of |flow| inside the mask, pixels of the full picture"""
+    """Mean over the picture of |optical flow| inside the mask, pixels of the full picture"""
     noise: float
     """Standard deviation of the blurred difference where nothing moves, grey values"""
 
@@ -103,30 +103,30 @@ def measure_step(before: np.ndarray, after: np.ndarray, options: MotionOptions) 
             f"motion needs two grey uint8 pictures of one size, but has {before.dtype} {before.shape} "
             f"and {after.dtype} {after.shape}"
         )
-    flow = optical_flow(before, after, options)
+    vectors = optical_flow(before, after, options)
     size = fitted_size(before.shape[1], before.shape[0], options.width)
-    speed = cv2.resize(np.hypot(flow[..., 0], flow[..., 1]), size)  # [hm, wm]
+    speed = cv2.resize(np.hypot(vectors[..., 0], vectors[..., 1]), size)  # [hm, wm]
     mask, noise = changed(_shrunk(before, size), _shrunk(after, size), options)
     if options.evidence is Evidence.CHANGE:
         mask = _filled(_closed(mask, options.closing_px), speed > options.tau_px, options.hole_share)
     else:
         mask = speed > options.tau_px
-    return Step(flow, mask, float((speed * mask).mean()), noise)
+    return Step(vectors, mask, float((speed * mask).mean()), noise)
 
 
 def optical_flow(before: np.ndarray, after: np.ndarray, options: MotionOptions) -> np.ndarray:
-    """Flow from `before` to `after`, uint8 [H, W] each: float32 [h, w, 2], in pixels of the given pictures."""
+    """Optical flow from `before` to `after`, uint8 [H, W] each: float32 [h, w, 2], in pixels of the given pictures."""
     height, width = before.shape
     size = fitted_size(width, height, min(options.flow_width, options.width))
     presets = {
-        FlowPreset.ULTRAFAST: cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
-        FlowPreset.FAST: cv2.DISOPTICAL_FLOW_PRESET_FAST,
-        FlowPreset.MEDIUM: cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
+        DisPreset.ULTRAFAST: cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
+        DisPreset.FAST: cv2.DISOPTICAL_FLOW_PRESET_FAST,
+        DisPreset.MEDIUM: cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
     }
     engine = cv2.DISOpticalFlow.create(presets[options.preset])
     empty = np.zeros((size[1], size[0], 2), dtype=np.float32)
-    flow = np.asarray(engine.calc(_shrunk(before, size), _shrunk(after, size), empty))
-    return flow * np.array([width / size[0], height / size[1]], dtype=np.float32)
+    vectors = np.asarray(engine.calc(_shrunk(before, size), _shrunk(after, size), empty))
+    return vectors * np.array([width / size[0], height / size[1]], dtype=np.float32)
 
 
 def changed(before: np.ndarray, after: np.ndarray, options: MotionOptions) -> tuple[np.ndarray, float]:
@@ -147,7 +147,7 @@ def changed(before: np.ndarray, after: np.ndarray, options: MotionOptions) -> tu
 
 
 def fitted_size(width: int, height: int, limit: int) -> tuple[int, int]:
-    """Width and height of a picture shrunk to at most `limit` wide; at least 16 each, below which no flow is found."""
+    """Width and height of a picture shrunk to at most `limit` wide; at least 16 each, or no motion is found."""
     if width <= limit:
         return width, height
     return limit, max(16, round(height * limit / width))
@@ -213,7 +213,8 @@ def _connected(low: np.ndarray, high: np.ndarray, least_area: int) -> np.ndarray
     keep[labels[high]] = True
     keep &= stats[:, cv2.CC_STAT_AREA] >= least_area
     keep[0] = False
-    return keep[labels]
+    kept: np.ndarray = keep[labels]
+    return kept
 
 
 def _closed(mask: np.ndarray, radius_px: int) -> np.ndarray:
@@ -231,11 +232,12 @@ def _filled(outline: np.ndarray, moving: np.ndarray, hole_share: float) -> np.nd
     area = stats[:, cv2.CC_STAT_AREA]
     inside = (np.bincount(labels[moving], minlength=count) > 0.5 * area) & (area <= hole_share * outline.size)
     inside[0] = True  # label 0 is the outline itself
-    return inside[labels]
+    filled: np.ndarray = inside[labels]
+    return filled
 
 
 def options_from_json(data: Mapping[str, Any]) -> MotionOptions:
     """Inverse of dataclasses.asdict, through JSON."""
-    enums = {"evidence": Evidence, "backend": FlowBackend, "preset": FlowPreset}
+    enums = {"evidence": Evidence, "backend": MotionBackend, "preset": DisPreset}
     values: dict[str, Any] = {key: enums[key](value) if key in enums else value for key, value in data.items()}
     return MotionOptions(**values)

@@ -10,17 +10,21 @@ rows that may change inside a segment come first.
         shown = scene.gaussians(7, into=shown)      # in place: what stands still is not written again
 """
 
-from packuv.scene.encoder import EncodeOptions
+from packuv.scene.encoder import TOLERANCES, EncodeOptions, Quality
 from packuv.scene.header import SceneHeader
 from packuv.scene.reader import Scene, open_scene
+from packuv.scene.stream import Tolerance
 from packuv.scene.verify import VerifyReport, verify_scene
 from packuv.scene.writer import SceneSummary, write_scene
 
 __all__ = [
+    "TOLERANCES",
     "EncodeOptions",
+    "Quality",
     "Scene",
     "SceneHeader",
     "SceneSummary",
+    "Tolerance",
     "VerifyReport",
     "open_scene",
     "verify_scene",

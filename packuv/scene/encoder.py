@@ -21,7 +21,7 @@ import numpy as np
 
 from packuv.gaussians.codes import Codes
 from packuv.gaussians.segment import Segment
-from packuv.scene.header import DYNAMIC, KEY, SceneHeader, SceneIndex, SegmentEntry, TrackEntry, digest
+from packuv.scene.header import DYNAMIC, KEY, SceneHeader, SceneIndex, SegmentEntry, TrackEntry, codes_digest
 from packuv.scene.matroska import Encoder, Packet, Spool
 from packuv.scene.mosaic import NEUTRAL, Mosaic
 from packuv.scene.sharing import KeyPlanner, KeyReplay, reordered
@@ -219,7 +219,7 @@ class SceneEncoder:
         self._queue.put(track, frame, self._writers[track].start(rows, flags))
 
     def _digest(self, codes: Codes, progress: Callable[[int], None]) -> None:
-        self._digests.append(digest(codes))
+        self._digests.append(codes_digest(codes))
         progress(len(self._digests))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import Codes, Quantizer
-from packuv.scene.matroska import Track
+from packuv.scene.matroska import VideoTrack
 from packuv.scene.mosaic import BLOCK, Mosaic
 from packuv.scene.stream import REPEAT, Tolerance, channel_names
 
@@ -69,7 +69,8 @@ class SceneHeader:
     @property
     def times_ms(self) -> np.ndarray:
         """Presentation times in the file, int64 [T]: milliseconds after the first frame."""
-        return (self.times_ns - self.times_ns[:1] + 500_000) // 1_000_000
+        milliseconds: np.ndarray = (self.times_ns - self.times_ns[:1] + 500_000) // 1_000_000
+        return milliseconds
 
     def first(self, frames: int) -> SceneHeader:
         """The header of a scene that ends after so many frames."""
@@ -142,8 +143,8 @@ class TrackEntry:
     crc32: tuple[int, ...] = ()
     """CRC-32 (zlib's) of each packet; FFmpeg reports no failed slice checksum to its caller"""
 
-    def video(self, number: int) -> Track:
-        return Track(TRACK_NAMES[number], self.mosaic.width, self.mosaic.height, self.slices)
+    def video(self, number: int) -> VideoTrack:
+        return VideoTrack(TRACK_NAMES[number], self.mosaic.width, self.mosaic.height, self.slices)
 
     def to_json(self, number: int, names: Sequence[str]) -> dict[str, Any]:
         mosaic = self.mosaic
@@ -193,7 +194,7 @@ class SceneIndex:
     """The key track and, if anything ever changes, the dynamic track"""
     segments: tuple[SegmentEntry, ...]
     digests: tuple[str, ...]
-    """`digest` of each frame's codes"""
+    """`codes_digest` of each frame's codes"""
     tools: Mapping[str, str]
     """Versions of the programs that wrote the file"""
 
@@ -287,7 +288,7 @@ class SceneIndex:
             raise ValueError(f"its header {HEADER} cannot be read: {error}") from None
 
 
-def digest(codes: Codes) -> str:
+def codes_digest(codes: Codes) -> str:
     """BLAKE2b of 16 bytes, in hex, over the positions (little-endian, row by row), then the attributes."""
     hasher = hashlib.blake2b(np.ascontiguousarray(codes.xyz, dtype="<u2").data, digest_size=16)
     hasher.update(np.ascontiguousarray(codes.attributes).data)

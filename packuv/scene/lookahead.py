@@ -110,7 +110,7 @@ class LookAhead:
 
     def _decoder(self, track: int) -> Decoder:
         """This thread's decoder of a track."""
-        decoders = self._local.__dict__.setdefault("decoders", {})
+        decoders: dict[int, Decoder] = self._local.__dict__.setdefault("decoders", {})
         if track not in decoders:
             decoders[track] = self._reader.decoder(track, self._index.tracks[track].video(track))
         return decoders[track]

@@ -24,7 +24,7 @@ BLOCK_HEADER = 64
 
 
 @dataclass(frozen=True)
-class Track:
+class VideoTrack:
     """One FFV1 video track of 8-bit grey pictures."""
 
     name: str
@@ -48,7 +48,7 @@ class Packet:
 class Encoder:
     """Codes the pictures of one track, on the calling thread."""
 
-    def __init__(self, track: Track) -> None:
+    def __init__(self, track: VideoTrack) -> None:
         self._context = av.CodecContext.create("ffv1", "w")
         assert isinstance(self._context, av.VideoCodecContext)
         _configure(self._context, track)
@@ -72,7 +72,7 @@ class Encoder:
 class Decoder:
     """Decodes the pictures of one track, on the calling thread."""
 
-    def __init__(self, track: Track, extradata: bytes | None) -> None:
+    def __init__(self, track: VideoTrack, extradata: bytes | None) -> None:
         self._track = track
         self._context = av.CodecContext.create("ffv1", "r")
         assert isinstance(self._context, av.VideoCodecContext)
@@ -94,7 +94,7 @@ class Decoder:
         return frames[0].to_ndarray()
 
 
-def _configure(context: av.VideoCodecContext, track: Track) -> None:
+def _configure(context: av.VideoCodecContext, track: VideoTrack) -> None:
     context.width, context.height, context.pix_fmt = track.width, track.height, "gray"
     context.time_base = TIME_BASE
     context.options = {
@@ -128,7 +128,7 @@ class Spool:
 
 def write_matroska(
     path: Path,
-    tracks: Sequence[Track],
+    tracks: Sequence[VideoTrack],
     packets: Iterable[Packet],
     attachments: Mapping[str, tuple[str, bytes]],
     *,
@@ -153,7 +153,7 @@ def write_matroska(
             container.mux(_muxable(packet, streams[packet.track]))
 
 
-def _muxable(packet: Packet, stream: Any) -> av.Packet:
+def _muxable(packet: Packet, stream: Any) -> av.Packet[Any]:
     out = av.Packet(packet.data)
     out.stream, out.time_base = stream, TIME_BASE
     out.pts = out.dts = packet.time_ms
@@ -198,9 +198,9 @@ class Reader:
                 self._container.close()
                 raise ValueError(f"{path}: video track {number} must be FFV1; the file is damaged or no scene")
         self._extradata = [stream.codec_context.extradata for stream in self._container.streams.video]
-        self._packets: Iterator[av.Packet] = self._container.demux(*self._container.streams.video)
+        self._packets: Iterator[av.Packet[Any]] = self._container.demux(*self._container.streams.video)
 
-    def decoder(self, number: int, track: Track) -> Decoder:
+    def decoder(self, number: int, track: VideoTrack) -> Decoder:
         """A new decoder for a track of the file; decoders may work at the same time, each on one thread."""
         return Decoder(track, self._extradata[number])
 

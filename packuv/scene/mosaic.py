@@ -94,7 +94,8 @@ class Mosaic:
         backwards = block_y % 2 == 1
         block_x = np.where(backwards, self.blocks_across - 1 - block_x, block_x)
         x = np.where(backwards, BLOCK - 1 - x, x)
-        return (block_y * BLOCK + y) * self.width + block_x * BLOCK + x
+        cells: np.ndarray = (block_y * BLOCK + y) * self.width + block_x * BLOCK + x
+        return cells
 
     def blank(self) -> np.ndarray:
         """A picture without rows, uint8 [height, width]."""
@@ -117,7 +118,8 @@ class Mosaic:
 
     def read_flags(self, picture: np.ndarray, count: int) -> np.ndarray:
         """The first `count` flags of a picture, uint8."""
-        return picture.reshape(-1)[self.flag_corner + self.cells[:count]] - np.uint8(NEUTRAL)
+        flags: np.ndarray = picture.reshape(-1)[self.flag_corner + self.cells[:count]] - np.uint8(NEUTRAL)
+        return flags
 
 
 @kernel()

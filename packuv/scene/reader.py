@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from packuv.scene.matroska import Reader
 from packuv.scene.sharing import assemble
 from packuv.scene.stream import REPEAT, Playback, key_codes
 
-NO_ROWS = np.empty((0, 0), np.uint8)
+NO_RESIDUALS = np.empty((0, 0), np.uint8)
 
 
 def open_scene(path: Path, *, threads: int = 0) -> Scene:
@@ -47,7 +48,6 @@ class Scene:
             raise
         self._reader = reader
         self._pictures = LookAhead(path, reader, self.index, workers=worker_count(threads))
-        self._starts = [segment.first for segment in self.index.segments]
         self._keys: dict[int, Codes] = {}  # of the segment at hand and those on the way to it, as their keys were
         self._segment = self._frame = -1
         self._playback: Playback | None = None
@@ -79,6 +79,12 @@ class Scene:
         """The frame on display at a time on the capture's clock: the last one that is not later, or the first."""
         return max(0, bisect_right(self.header.times_ns, time_ns) - 1)
 
+    def segment_at(self, frame: int) -> int:
+        """Number of the segment that holds a frame. Raises IndexError outside the scene."""
+        if not 0 <= frame < len(self):
+            raise IndexError(f"frame {frame} of a scene with {len(self)} frames")
+        return bisect_right(self.index.segments, frame, key=attrgetter("first")) - 1
+
     def codes(self, frame: int) -> Codes:
         """All Gaussians of a frame as integers, absent ones (opacity code 0) included; yours to change."""
         codes = self._seek(frame)
@@ -104,9 +110,7 @@ class Scene:
 
     def _seek(self, frame: int) -> Codes:
         """Bring the playback to a frame; on an error nothing half-done stays behind."""
-        if not 0 <= frame < len(self):
-            raise IndexError(f"frame {frame} of a scene with {len(self)} frames")
-        segment = bisect_right(self._starts, frame) - 1
+        segment = self.segment_at(frame)
         reading_on = frame == self._frame + 1
         horizon = len(self) - 1 if reading_on else frame
         try:
@@ -154,9 +158,10 @@ class Scene:
     def _advance(self, horizon: int) -> None:
         """Add the next frame's residuals."""
         assert self._playback is not None
-        entry, step = self.index.segments[self._segment], self._frame + 1 - self._starts[self._segment]
+        entry = self.index.segments[self._segment]
+        step = self._frame + 1 - entry.first
         prediction, differences = entry.predictions[step - 1], bool(entry.differences[step - 1])
-        rows = NO_ROWS
+        rows = NO_RESIDUALS
         if prediction != REPEAT:
             picture, track = self._next_picture(self._segment, step, horizon), self.index.tracks[DYNAMIC]
             count = self._playback.toggle(track.mosaic.read_flags(picture, entry.dynamic))
@@ -171,13 +176,13 @@ class Scene:
 
     def _wanted(self, number: int, step: int, horizon: int) -> Iterator[Address]:
         """Pictures that are needed from `step` frames after a segment's key on, up to a frame, in order."""
-        known = set(self._keys)
-        for segment in range(number, len(self._starts)):
-            entry = self.index.segments[segment]
+        known, segments = set(self._keys), self.index.segments
+        for segment in range(number, len(segments)):
+            entry = segments[segment]
             if entry.first > horizon and segment > number:
                 return
             if step == 0:
-                yield from (Address(KEY, k, self._starts[k]) for k in self._way(segment) if k not in known)
+                yield from (Address(KEY, k, segments[k].first) for k in self._way(segment) if k not in known)
                 known.update(self._way(segment))
                 step = 1
             packet = entry.packet(step)
@@ -198,11 +203,3 @@ def _read_index(path: Path, reader: Reader) -> SceneIndex:
     if reader.tracks[: len(expected)] != expected:
         raise ValueError(f"{path} must have the video tracks {expected}, but has {reader.tracks}")
     return index
-
-
-def segment_of(scene: Scene, frame: int) -> int:
-    """Number of the segment that holds a frame."""
-    for number, entry in enumerate(scene.index.segments):
-        if entry.first <= frame < entry.first + entry.frames:
-            return number
-    raise IndexError(f"frame {frame} of a scene with {len(scene)} frames")

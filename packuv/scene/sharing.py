@@ -30,7 +30,8 @@ def morton_codes(xyz: np.ndarray) -> np.ndarray:
         spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
     for shift, mask in ((4, 0x30C30C30C30C30C3), (2, 0x9249249249249249)):
         spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-    return spread[:, 0] | spread[:, 1] << np.uint64(1) | spread[:, 2] << np.uint64(2)
+    codes: np.ndarray = spread[:, 0] | spread[:, 1] << np.uint64(1) | spread[:, 2] << np.uint64(2)
+    return codes
 
 
 def row_order(xyz: np.ndarray, dynamic: np.ndarray) -> np.ndarray:

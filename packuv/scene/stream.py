@@ -36,9 +36,6 @@ def channel_names(sh_degree: int) -> tuple[str, ...]:
     return (*fixed, "rotation_x", "rotation_y", "rotation_z", "opacity", *sh)
 
 
-# Absent rows
-
-
 # The key frame
 
 
@@ -137,8 +134,8 @@ class Playback:
         if prediction == REPEAT:
             self.velocity[:] = 0
             return
-        _add(rows, self.stored, prediction == LINEAR, differences, *self._steps,
-             self.codes.xyz, self.codes.attributes, self.velocity)  # fmt: skip
+        linear, codes = prediction == LINEAR, self.codes
+        _add(rows, self.stored, linear, differences, *self._steps, codes.xyz, codes.attributes, self.velocity)
 
 
 class Coder:
@@ -167,8 +164,17 @@ class Coder:
         previous, linear = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
         attributes = np.empty_like(now.attributes)
         last = self._playback.codes
-        _residuals(now.xyz, now.attributes, last.xyz, last.attributes, self._playback.velocity, *self._steps,
-                   previous, linear, attributes)  # fmt: skip
+        _residuals(
+            now.xyz,
+            now.attributes,
+            last.xyz,
+            last.attributes,
+            self._playback.velocity,
+            *self._steps,
+            previous,
+            linear,
+            attributes,
+        )
         plain = np.concatenate([previous, attributes], axis=1)
         if (plain == NEUTRAL).all():
             return Change(REPEAT, False, np.zeros(len(now), np.uint8), plain[:0])
@@ -192,8 +198,9 @@ def changes(stored: Segment, tolerance: Tolerance) -> Iterator[tuple[Change, Cod
 
 
 @kernel()
-def _residuals(xyz, attributes, last_xyz, last_attributes, velocity, position_step, attribute_step, previous, linear,
-               others):  # fmt: skip
+def _residuals(
+    xyz, attributes, last_xyz, last_attributes, velocity, position_step, attribute_step, previous, linear, others
+):
     """Bytes of both position residuals [D, 6] and of the attributes' [D, A], around 128."""
     for i in range(len(xyz)):
         present = attributes[i, OPACITY] > 0
@@ -308,4 +315,5 @@ def changing_channels(segment: Segment) -> np.ndarray:
 def _changed(key: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """Whether each column of frames [T - 1, D, columns] ever differs from the frame before it, or from the key."""
     before = np.concatenate([key[None], frames])[:-1]
-    return (frames != before).any(axis=(0, 1))
+    changed: np.ndarray = (frames != before).any(axis=(0, 1))
+    return changed

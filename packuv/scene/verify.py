@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from packuv.progress import Progress, no_progress
-from packuv.scene.header import TRACK_NAMES, SegmentEntry, digest
+from packuv.scene.header import TRACK_NAMES, SegmentEntry, codes_digest
 from packuv.scene.lookahead import DamageError
 from packuv.scene.reader import Scene, open_scene
 
@@ -60,7 +60,7 @@ def _check_frames(scene: Scene, segment: SegmentEntry) -> Iterator[tuple[int, Va
             yield frame, lost
             continue
         try:
-            same = digest(scene._seek(frame)) == scene.index.digests[frame]
+            same = codes_digest(scene._seek(frame)) == scene.index.digests[frame]
         except ValueError as error:
             lost = error
             yield frame, lost

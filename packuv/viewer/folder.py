@@ -27,9 +27,9 @@ from packuv.viewer.streams import (
     StreamWriter,
     WebCodec,
     add_planes,
+    code_planes,
+    codes_of_planes,
     delta_planes,
-    key_codes,
-    key_planes,
     read_stream,
 )
 
@@ -135,7 +135,7 @@ def _write_video(
         )
         for entry in entries:
             last = scene.codes(entry.first)
-            keys.add(key_planes(last), starts=True)
+            keys.add(code_planes(last), starts=True)
             checks.append(checksum(last))
             progress(len(checks))
             for frame in range(entry.first + 1, entry.first + entry.frames):
@@ -158,7 +158,7 @@ def _write_video(
 
 def checksum(codes: Codes) -> int:
     """CRC-32 over the bytes of a frame, plane by plane: high bytes of x y z, low bytes, attributes."""
-    return zlib.crc32(key_planes(codes).tobytes())
+    return zlib.crc32(code_planes(codes).tobytes())
 
 
 # Reading
@@ -176,7 +176,7 @@ def read_video(folder: Path) -> Iterator[Codes]:
     with (folder / video["key"]["file"]).open("rb") as a, (folder / video["delta"]["file"]).open("rb") as b:
         keys, deltas = read_stream(a, video["key"], codec), read_stream(b, video["delta"], codec)
         for segment in video["segments"]:
-            codes = key_codes(sheets[0].read(_next(keys, folder), segment["rows"]))
+            codes = codes_of_planes(sheets[0].read(_next(keys, folder), segment["rows"]))
             yield codes
             count = segment["dynamic"]
             for _ in range(segment["frames"] - 1):
@@ -212,7 +212,7 @@ def read_deltas(folder: Path) -> Iterator[Codes]:
 def read_index(folder: Path) -> dict[str, Any]:
     """index.json of a folder for the web; raises FileNotFoundError, or ValueError for another one."""
     try:
-        index = json.loads((folder / INDEX).read_text())
+        index: dict[str, Any] = json.loads((folder / INDEX).read_text())
         known = (index["format"], index["version"]) == (FORMAT, VERSION)
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{folder / INDEX} is no index of a scene: {error!r}") from None

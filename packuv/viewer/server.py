@@ -18,6 +18,7 @@ from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 from packuv.viewer.source import Source, describe, frame_bytes, key_bytes, open_source, tables_bytes
 
@@ -71,10 +72,10 @@ class ViewerServer(ThreadingHTTPServer):
         self.reading = threading.Lock()  # decoders keep state
         self.tables = lru_cache(maxsize=1)(lambda: tables_bytes(source.quantizer))
 
-    def handle_error(self, request: object, client_address: object) -> None:
+    def handle_error(self, request: Any, client_address: Any) -> None:
         """A page that seeks or closes drops its requests; that is no news."""
         if not isinstance(sys.exception(), ConnectionError):
-            super().handle_error(request, client_address)  # type: ignore[arg-type]
+            super().handle_error(request, client_address)
 
     @property
     def url(self) -> str:

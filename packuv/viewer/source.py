@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -177,7 +178,7 @@ def locate(segments: Sequence[range], frame: int) -> tuple[int, int]:
     """Segment and offset within it; raises IndexError outside the scene."""
     if not 0 <= frame < segments[-1].stop:
         raise IndexError(f"frame {frame} of a scene with {segments[-1].stop} frames")
-    segment = bisect_right([frames.start for frames in segments], frame) - 1
+    segment = bisect_right(segments, frame, key=attrgetter("start")) - 1
     return segment, frame - segments[segment].start
 
 

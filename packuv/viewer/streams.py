@@ -18,10 +18,10 @@ import av
 import numpy as np
 
 from packuv.gaussians.codes import Codes
+from packuv.scene.mosaic import NEUTRAL
 
 TILE = 16
 """Rows fill square tiles of this side; neighbours in a scene's order are neighbours in space"""
-NEUTRAL = 128
 MOST_PIXELS = 16384
 """Longest side of a picture: what browsers' decoders take"""
 _IVF_FRAME = struct.Struct("<IQ")
@@ -41,7 +41,11 @@ class WebCodec(StrEnum):
 
 @dataclass(frozen=True)
 class Sheet:
-    """How byte planes tile a picture: plane p at (p % across, p // across), row i in the same cell of each."""
+    """How byte planes tile a picture: plane p at (p % across, p // across), row i in the same cell of each.
+
+    Not a scene file's `Mosaic`, whose Hilbert blocks, FFV1 slices, missing planes and flags are that file's own: any
+    page can find a cell here by three divisions, and every plane is there.
+    """
 
     planes: int
     tiles_across: int
@@ -81,7 +85,8 @@ class Sheet:
         y, x = np.divmod(row % TILE**2, TILE)
         plane_y, plane_x = np.divmod(plane, self.across)
         top = plane_y * self.tiles_down * TILE + tile_y * TILE + y
-        return top * self.width + plane_x * self.tiles_across * TILE + tile_x * TILE + x
+        cells: np.ndarray = top * self.width + plane_x * self.tiles_across * TILE + tile_x * TILE + x
+        return cells
 
     def draw(self, rows: np.ndarray) -> np.ndarray:
         """The picture, uint8 [height, width], of byte planes [planes, n]; all else is 128."""
@@ -91,7 +96,7 @@ class Sheet:
 
     def read(self, picture: np.ndarray, count: int) -> np.ndarray:
         """Byte planes uint8 [planes, count] of a picture."""
-        return picture.reshape(-1)[self.cells(count)]
+        return picture.reshape(-1).take(self.cells(count))
 
     def to_json(self) -> dict[str, int]:
         return {**vars(self), "tile": TILE, "across": self.across, "width": self.width, "height": self.height}
@@ -100,13 +105,13 @@ class Sheet:
 # Rows as bytes
 
 
-def key_planes(codes: Codes) -> np.ndarray:
+def code_planes(codes: Codes) -> np.ndarray:
     """High bytes of x y z, low bytes, attributes: uint8 [6 + A, N]."""
     return np.concatenate([codes.xyz.T >> 8, codes.xyz.T & 255, codes.attributes.T]).astype(np.uint8)
 
 
-def key_codes(planes: np.ndarray) -> Codes:
-    """Inverse of `key_planes`."""
+def codes_of_planes(planes: np.ndarray) -> Codes:
+    """Inverse of `code_planes`."""
     xyz = planes[:3].astype(np.uint16) << 8 | planes[3:6]
     return Codes(np.ascontiguousarray(xyz.T), np.ascontiguousarray(planes[6:].T))
 
@@ -114,12 +119,12 @@ def key_codes(planes: np.ndarray) -> Codes:
 def delta_planes(now: Codes, last: Codes) -> np.ndarray:
     """What to add to `last` for `now`, modulo 2^16 and 2^8, each byte around 128: uint8 [6 + A, D]."""
     step = Codes(now.xyz - last.xyz + np.uint16(257 * NEUTRAL), now.attributes - last.attributes + np.uint8(NEUTRAL))
-    return key_planes(step)
+    return code_planes(step)
 
 
 def add_planes(last: Codes, planes: np.ndarray) -> Codes:
     """Inverse of `delta_planes`."""
-    step = key_codes(planes)
+    step = codes_of_planes(planes)
     return Codes(last.xyz + step.xyz - np.uint16(257 * NEUTRAL), last.attributes + step.attributes - np.uint8(NEUTRAL))
 
 

@@ -74,7 +74,7 @@ def import_splats(arguments: argparse.Namespace) -> int:
 
 
 def _import_atlas(arguments: argparse.Namespace) -> int:
-    from packuv.atlas.restore import import_atlas
+    from packuv.atlas import import_atlas
 
     with shown(arguments, "import") as progress:
         report = import_atlas(arguments.inputs[0], arguments.output, progress=progress)
@@ -187,7 +187,7 @@ def _depths(scene: Scene, rig: Rig) -> Any:
 
 def atlas(arguments: argparse.Namespace) -> int:
     """`packuv atlas`: the UV atlas of one frame as a picture for people."""
-    from packuv.atlas.picture import sheet, write_png
+    from packuv.atlas import sheet, write_png
     from packuv.scene import open_scene
 
     with open_scene(arguments.scene) as scene:
@@ -201,8 +201,8 @@ def atlas(arguments: argparse.Namespace) -> int:
 
 def export_atlas(arguments: argparse.Namespace) -> int:
     """`packuv export atlas`: the atlas as an ordinary video."""
-    from packuv.atlas.video import AtlasCodec, AtlasVideoOptions
-    from packuv.atlas.video import export_atlas as write
+    from packuv.atlas import AtlasCodec, AtlasVideoOptions
+    from packuv.atlas import export_atlas as write
 
     options = AtlasVideoOptions(AtlasCodec(arguments.codec), arguments.crf, _uv(arguments))
     with shown(arguments, "export") as progress:
@@ -238,7 +238,7 @@ def _uv(arguments: argparse.Namespace) -> UvOptions:
 
 def web(arguments: argparse.Namespace) -> int:
     """`packuv web`: the scene as static files for any web server."""
-    from packuv.viewer.folder import WebCodec, WebOptions, write_web
+    from packuv.viewer import WebCodec, WebOptions, write_web
 
     with shown(arguments, "web") as progress:
         summary = write_web(

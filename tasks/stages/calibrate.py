@@ -17,7 +17,7 @@ from calibration.judge import judge
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
-from packuv.files import write_json
+from packuv.files import save_json
 from sync.align import FrameGroups
 from sync.capture import Capture, find_capture
 from tasks.artefacts.stage import Files, Notes, Stage, Work
@@ -166,7 +166,7 @@ class FindPoints(Stage):
         report = balance(points, options=options.balance)
         points.save(work.out / POINTS)
         with_gains(rig, report).save(work.out / RIG)
-        write_json(work.out / COLOUR, without_nan(report.to_json()))
+        save_json(work.out / COLOUR, without_nan(report.to_json()))
         return {"points": len(points.xyz), "balanced": report.kept, "reason": report.reason, **_figures(points)}
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
@@ -192,8 +192,8 @@ def complete_instants(groups: FrameGroups, cameras: tuple[str, ...], first: int)
 def _save_rig(rig: Rig, options: RigOptions, evidence: Mapping[str, Any], out: Path) -> None:
     report = check_rig(rig, options=options.check)
     rig.save(out / RIG)
-    write_json(out / CHECK, without_nan(report.to_json()))
-    write_json(out / MATCHES, without_nan(evidence))
+    save_json(out / CHECK, without_nan(report.to_json()))
+    save_json(out / MATCHES, without_nan(evidence))
 
 
 def _figures(points: SparsePoints) -> dict[str, float]:

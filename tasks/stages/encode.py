@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.files import write_json
+from packuv.files import save_json
 from packuv.fit.keyframe import KeyState
 from packuv.footage.lens import undistorted_camera
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.segment import Segment
-from packuv.scene import EncodeOptions, SceneHeader, open_scene, write_scene
+from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
 from packuv.scene.sharing import stored_segments
-from packuv.scene.stream import Tolerance
 from sync.align import SyncReport
 from tasks.artefacts.stage import Notes, Site, Stage, Work
 from tasks.artefacts.store import Key
@@ -45,7 +44,7 @@ class Encode(Stage):
         path = work.out / SCENE
         summary = write_scene(path, segments, header, options=self.options, progress=work.progress)
         notes = {"frames": summary.frames, "bytes": summary.bytes, "track_bytes": dict(summary.track_bytes)}
-        write_json(work.out / "encode.json", notes)
+        save_json(work.out / "encode.json", notes)
         return notes
 
     def write_finished(self, path: Path, site: Site) -> int:
@@ -89,7 +88,7 @@ class Verify(Stage):
             if frame != len(opened):
                 raise RuntimeError(f"{scene} has {len(opened)} frames, but {frame} were fitted")
         notes = {"frames": frame, "exact": worst.exact, "largest_error": vars(worst)}
-        write_json(work.out / "verify.json", notes)
+        save_json(work.out / "verify.json", notes)
         return notes
 
 

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from packuv.files import write_json
-from packuv.footage.lens import LensCamera
-from packuv.footage.views import Views
+from packuv.files import save_json
+from packuv.footage import LensCamera, Views
 from packuv.progress import Progress
 from packuv.scene import open_scene
 from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
@@ -58,7 +57,7 @@ class Evaluate(Stage):
             write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
             borders = segment_starts(opened)
             facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=borders)
-        write_json(work.out / METRICS, facts)
+        save_json(work.out / METRICS, facts)
         return {name: facts[name] for name in ("cameras", "held_out", "mean")}
 
 

@@ -11,18 +11,25 @@ from pathlib import Path
 import numpy as np
 
 from calibration.triangulate import SparsePoints
-from packuv.files import write_json
+from packuv.files import save_json
 from packuv.fit.frames import fit_segment
 from packuv.fit.keyframe import KeyState, fit_first, fit_next
 from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
 from packuv.fit.seam import seam, tail
 from packuv.fit.start.points import Points
-from packuv.footage.views import Views
+from packuv.footage import Views
 from packuv.gaussians.rows import hold_absent
 from packuv.gaussians.segment import Segment
-from packuv.motion.background import BackgroundOptions, Still, find_background, load_stills, save_stills
-from packuv.motion.cache import MotionCache
-from packuv.motion.step import MotionOptions, changed_between
+from packuv.motion import (
+    BackgroundOptions,
+    MotionCache,
+    MotionOptions,
+    Still,
+    changed_between,
+    find_background,
+    load_stills,
+    save_stills,
+)
 from sync.align import FrameGroups
 from tasks.artefacts.stage import Notes, Stage, Work
 from tasks.artefacts.store import Key
@@ -148,7 +155,7 @@ class FitSegment(Stage):
             progress=work.progress,
         )
         hold_absent(segment).save(work.out / SEGMENT)
-        write_json(work.out / FIGURES, {"frames": figures})
+        save_json(work.out / FIGURES, {"frames": figures})
         return {"frames": len(segment), "gaussians": len(segment.key), "dynamic": int(segment.dynamic.sum())}
 
 
@@ -166,7 +173,7 @@ class CutSegment(Stage):
         part = replace(whole, xyz=whole.xyz[: frames - 1], attributes=whole.attributes[: frames - 1])
         part.save(work.out / SEGMENT)
         figures = json.loads((folder / FIGURES).read_text())["frames"][: frames - 1]
-        write_json(work.out / FIGURES, {"frames": figures})
+        save_json(work.out / FIGURES, {"frames": figures})
         return {"frames": frames, "gaussians": len(part.key), "dynamic": int(part.dynamic.sum())}
 
 
@@ -185,7 +192,7 @@ class MeasureSeam(Stage):
         views = Footage(self.take, work.site).open_views()
         found = seam(before, Segment.load(work.path(self.segment) / SEGMENT), after, views)
         facts = {"ratio": found if math.isfinite(found) else None}
-        write_json(work.out / SEAM, facts)
+        save_json(work.out / SEAM, facts)
         return facts
 
 

@@ -9,9 +9,7 @@ import numpy as np
 
 from calibration.rig import Camera, Rig
 from packuv.camera import PinholeCamera
-from packuv.footage.lens import LensCamera
-from packuv.footage.reader import FrameReader
-from packuv.footage.views import Views
+from packuv.footage import FrameReader, LensCamera, Views
 from sync.align import FrameGroups
 from sync.capture import find_capture
 from tasks.artefacts.stage import Site

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from packuv.files import write_json
-from packuv.motion.cache import MotionCache, measure_motion
+from packuv.files import save_json
+from packuv.motion import MotionCache, MotionOptions, measure_motion
 from packuv.motion.keyframes import KeyframeOptions, choose_keyframes, motion_curve, segments
-from packuv.motion.step import MotionOptions
 from tasks.artefacts.recipe import digest
 from tasks.artefacts.stage import Notes, Stage, Work
 from tasks.artefacts.store import Key
@@ -59,7 +58,7 @@ class ChooseKeyframes(Stage):
             "still": [not bool(moving[span.start + 1 : span.stop].any()) for span in spans],
             "curve_px": curve.tolist(),
         }
-        write_json(work.out / KEYFRAMES, facts)
+        save_json(work.out / KEYFRAMES, facts)
         return {"keyframes": len(keyframes), "instants": len(curve)}
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:

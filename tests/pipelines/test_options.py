@@ -6,8 +6,7 @@ import re
 
 import pytest
 
-from packuv.scene.encoder import TOLERANCES, Quality
-from packuv.scene.stream import Tolerance
+from packuv.scene import TOLERANCES, Quality, Tolerance
 from pipelines.options import SequenceOptions, compose
 from pipelines.request import PRESETS, RunRequest
 from sync.capture import CaptureSettings

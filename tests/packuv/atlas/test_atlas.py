@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from packuv.atlas import import_atlas
 from packuv.atlas.picture import (
     CAPTION,
     SHEET_GAP,
@@ -24,13 +25,12 @@ from packuv.atlas.picture import (
     triplet_names,
     write_png,
 )
-from packuv.atlas.restore import import_atlas
 from packuv.atlas.video import ATTACHMENT, EXACT_ALWAYS, AtlasCodec, AtlasVideo, AtlasVideoOptions, export_atlas
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.gaussians.uvmap import UvOptions, atlas_size
 from packuv.scene import SceneHeader, open_scene, write_scene
-from packuv.scene.header import digest
+from packuv.scene.header import codes_digest
 
 MAP = UvOptions(rows=64, columns=64, layers=4)
 
@@ -182,7 +182,7 @@ def test_every_codec_gives_back_the_very_integers(scene_path, tmp_path, codec):
             truth = scene.codes(frame)
             truth = truth[truth.attributes[:, OPACITY] > 0]
             assert as_set(codes) == as_set(truth)
-            assert digest(codes) == video.digests[frame]
+            assert codes_digest(codes) == video.digests[frame]
         assert video.header.to_json() == scene.header.to_json()
 
 

@@ -14,14 +14,11 @@ from packuv.fit.options import FitOptions
 from packuv.fit.seam import seam, tail
 from packuv.fit.shots import Shot
 from packuv.fit.start.first import StartOptions, round_gaussians
-from packuv.footage.lens import LensCamera
-from packuv.footage.views import Views
+from packuv.footage import LensCamera, Views
 from packuv.gaussians.codes import OPACITY
 from packuv.gaussians.floats import ATTRIBUTES
 from packuv.metrics import psnr
-from packuv.motion.background import find_background
-from packuv.motion.cache import MotionCache, measure_motion
-from packuv.motion.step import MotionOptions, changed_between
+from packuv.motion import MotionCache, MotionOptions, changed_between, find_background, measure_motion
 from packuv.raster import RasterOptions, render
 
 FRAMES = 4

@@ -26,8 +26,7 @@ from packuv.fit.keyframe import fit_first
 from packuv.fit.labels import LabelOptions
 from packuv.fit.start.shell import ShellOptions
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians
-from packuv.motion.background import find_background
-from packuv.motion.cache import MotionCache, measure_motion
+from packuv.motion import MotionCache, find_background, measure_motion
 
 FRAMES = 20
 CAMERAS = 6

@@ -52,20 +52,23 @@ def sog(gaussians, version=2):
     ranged = {"codebook": book.tolist()} if version == 2 else {"mins": [-4.0] * 4, "maxs": [4.0] * 4}
     opacity = alpha if version == 2 else indices(book, gaussians.opacity_logits[:, None])
     meta = {
-        "version": version, "count": n,
+        "version": version,
+        "count": n,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {**ranged, "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {**ranged, "files": ["sh0.webp"]},
-    }  # fmt: skip
+    }
     if version == 1:
         del meta["version"], meta["count"]
         meta["means"]["shape"] = [n, 3]
     files = {
-        "means_l.webp": webp(position & 255), "means_u.webp": webp(position >> 8), "quats.webp": webp(rotation),
+        "means_l.webp": webp(position & 255),
+        "means_u.webp": webp(position >> 8),
+        "quats.webp": webp(rotation),
         "scales.webp": webp(indices(book, gaussians.log_scales)),
         "sh0.webp": webp(np.concatenate([indices(book, gaussians.sh[:, 0]), opacity], axis=1)),
-    }  # fmt: skip
+    }
     if gaussians.sh_degree:
         coefficients = gaussians.sh.shape[1] - 1
         palette = np.zeros((-(-n // 64) * 64, coefficients, 4), np.uint8)

@@ -118,9 +118,12 @@ def half_turn(gaussians):
     flip = np.array([1, -1, -1], np.float32)
     turned = np.array([[0, 1, 0, 0]], np.float32)  # a half turn about x: w x y z
     return Gaussians(
-        gaussians.means * flip, gaussians.log_scales, times(turned, gaussians.quaternions),
-        gaussians.opacity_logits, gaussians.sh.copy(),
-    )  # fmt: skip
+        gaussians.means * flip,
+        gaussians.log_scales,
+        times(turned, gaussians.quaternions),
+        gaussians.opacity_logits,
+        gaussians.sh.copy(),
+    )
 
 
 def times(a, b):

@@ -2,9 +2,8 @@ import av
 import numpy as np
 import pytest
 
-from packuv.footage.lens import LensCamera
-from packuv.footage.views import Views
-from packuv.motion.background import BackgroundOptions, find_background, load_stills, save_stills
+from packuv.footage import LensCamera, Views
+from packuv.motion import BackgroundOptions, find_background, load_stills, save_stills
 
 FRAMES, HEIGHT, WIDTH = 9, 48, 64
 

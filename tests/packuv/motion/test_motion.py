@@ -1,4 +1,4 @@
-"""Flow and masks against known motion; the cache against interruption."""
+"""Optical flow and masks against known motion; the cache against interruption."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
-from packuv.footage.lens import LensCamera
-from packuv.footage.views import Views
-from packuv.motion.cache import MotionCache, measure_motion
+from packuv.footage import LensCamera, Views
+from packuv.motion import MotionCache, measure_motion
 from packuv.motion.step import (
     Evidence,
     MotionOptions,
@@ -63,16 +62,16 @@ def cover(mask: np.ndarray, radius_px: int = 3) -> np.ndarray:
 
 @settings(max_examples=12, deadline=None)
 @given(dx=st.integers(-9, 9), dy=st.integers(-9, 9))
-def test_flow_and_mask_of_a_moving_disc(dx: int, dy: int) -> None:
+def test_optical_flow_and_mask_of_a_moving_disc(dx: int, dy: int) -> None:
     step = measure_step(picture(150, 90), picture(150 + dx, 90 + dy), MotionOptions(flow_width=WIDTH))
     # Measured over all steps of up to 9 px: DIS is right to 0.12 px inside a textured disc.
-    error = np.linalg.norm(step.flow[disc(150, 90)] - [dx, dy], axis=1)
+    error = np.linalg.norm(step.optical_flow[disc(150, 90)] - [dx, dy], axis=1)
     assert np.median(error) < 0.25
     moved = disc(150, 90) | disc(150 + dx, 90 + dy)
     if dx or dy:
         assert cover(step.mask)[moved].all()
         assert not step.mask[~cover(moved, 8)].any()
-        # Mean over the picture of |flow| inside: the disc's share times its speed, with an outline on top.
+        # Mean over the picture of |optical flow| inside: the disc's share times its speed, with an outline on top.
         share = disc(150, 90).mean() * np.hypot(dx, dy)
         assert 0.8 * share < step.magnitude < 1.8 * share + 0.01
     else:
@@ -80,12 +79,12 @@ def test_flow_and_mask_of_a_moving_disc(dx: int, dy: int) -> None:
         assert step.magnitude == 0
 
 
-def test_flow_is_in_pixels_of_the_full_picture_at_any_width() -> None:
+def test_optical_flow_is_in_pixels_of_the_full_picture_at_any_width() -> None:
     before, after = picture(150, 90), picture(156, 90)
     for width in (320, 240, 160):
-        flow = optical_flow(before, after, MotionOptions(flow_width=width))
-        assert flow.shape[:2] == fitted_size(WIDTH, HEIGHT, width)[::-1]
-        inside = cv2.resize(flow, (WIDTH, HEIGHT))[disc(150, 90)]
+        vectors = optical_flow(before, after, MotionOptions(flow_width=width))
+        assert vectors.shape[:2] == fitted_size(WIDTH, HEIGHT, width)[::-1]
+        inside = cv2.resize(vectors, (WIDTH, HEIGHT))[disc(150, 90)]
         # DIS falls short by 6 % at 160; unscaled, it would by 50 %.
         assert np.linalg.norm(np.median(inside, axis=0) - [6, 0]) < 0.1 * 6
 
@@ -107,7 +106,7 @@ def test_flicker_of_the_whole_picture_is_no_motion() -> None:
     assert not measure_step(picture(150, 90), brighter, MotionOptions()).mask.any()
 
 
-def test_flow_fills_an_outline_that_shows_no_change_inside() -> None:
+def test_optical_flow_fills_an_outline_that_shows_no_change_inside() -> None:
     """A plain cloth that moves by a few pixels: brightness changes only along its four sides."""
     before, after = (np.full((HEIGHT, WIDTH), 170, dtype=np.uint8) for _ in range(2))
     before[60:110, 130:180] = 60
@@ -119,10 +118,10 @@ def test_flow_fills_an_outline_that_shows_no_change_inside() -> None:
     assert not filled[~cover(filled & bare, 30)].any()
 
 
-def test_the_flow_evidence_is_the_threshold_of_the_paper() -> None:
+def test_the_evidence_of_optical_flow_is_the_threshold_of_the_paper() -> None:
     options = MotionOptions(evidence=Evidence.FLOW, flow_width=WIDTH, tau_px=2)
     step = measure_step(picture(150, 90), picture(156, 90), options)
-    assert np.array_equal(step.mask, np.hypot(*np.moveaxis(step.flow, 2, 0)) > 2)
+    assert np.array_equal(step.mask, np.hypot(*np.moveaxis(step.optical_flow, 2, 0)) > 2)
 
 
 @given(
@@ -158,7 +157,7 @@ def test_options_survive_json_and_refuse_nonsense() -> None:
     assert options_from_json(json.loads(json.dumps(asdict(options)))) == options
     with pytest.raises(ValueError, match="0 < low <= high"):
         MotionOptions(low_sigmas=7)
-    with pytest.raises(ValueError, match="show no flow"):
+    with pytest.raises(ValueError, match="show no motion"):
         MotionOptions(width=8)
     with pytest.raises(ValueError, match="two grey uint8 pictures of one size"):
         measure_step(np.zeros((20, 20), np.uint8), np.zeros((20, 21), np.uint8), options)
@@ -211,7 +210,7 @@ def test_a_dropped_frame_makes_a_longer_step_and_no_peak(cache: MotionCache) -> 
     assert cache.previous[:9, 1].tolist() == [-1, 0, 1, 2, 3, -1, -1, 4, 7]
     assert np.isnan(cache.magnitude[[0, 5, 6, 20], 1]).all()
     assert cache.mask(1, 5) is None
-    assert cache.flow(1, 0) is None
+    assert cache.optical_flow(1, 0) is None
     longer, usual = cache.magnitude[7, 1], np.nanmedian(cache.magnitude[:, 1])
     assert 0.6 * usual < longer < 1.6 * usual
     mask = cache.mask(1, 7)
@@ -223,7 +222,7 @@ def test_cached_steps_equal_measured_ones(views: Views, cache: MotionCache) -> N
     before, after = (cv2.cvtColor(views.pixels(0, t), cv2.COLOR_RGB2GRAY) for t in (8, 9))  # type: ignore[arg-type]
     step = measure_step(before, after, cache.options)
     assert np.array_equal(cache.mask(0, 9), grown(step.mask, WIDTH, HEIGHT, cache.options.dilation_px))  # type: ignore[arg-type]
-    assert np.array_equal(cache.flow(0, 9), step.flow.astype(np.float16).astype(np.float32))  # type: ignore[arg-type]
+    assert np.array_equal(cache.optical_flow(0, 9), step.optical_flow.astype(np.float16).astype(np.float32))  # type: ignore[arg-type]
     assert cache.magnitude[9, 0] == np.float32(step.magnitude)
     assert cache.steps["share"][9, 0] == np.float32(step.mask.mean())
 
@@ -257,9 +256,9 @@ def test_workers_do_not_change_a_byte(views: Views, cache: MotionCache, tmp_path
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from packuv.footage.views import Views
-from packuv.motion.cache import measure_motion
-from packuv.motion.step import MotionOptions
+from packuv.footage import Views
+from packuv.motion import measure_motion
+from packuv.motion import MotionOptions
 import json
 def die(done, total):
     if done == int(sys.argv[3]):
@@ -292,13 +291,13 @@ def test_another_recipe_is_refused(views: Views, cache: MotionCache, tmp_path: P
         MotionCache.load(tmp_path)
 
 
-def test_flow_can_be_left_out(views: Views, cache: MotionCache, tmp_path: Path) -> None:
+def test_optical_flow_can_be_left_out(views: Views, cache: MotionCache, tmp_path: Path) -> None:
     short = Views(views.reader.videos, views.frames[:4], views.lenses)
     lean = measure_motion(short, tmp_path / "lean", MotionOptions(keep_flow=False))
     assert np.array_equal(lean.mask(0, 3), cache.mask(0, 3))  # type: ignore[arg-type]
     assert not (tmp_path / "lean" / "a.flow.npy").exists()
     with pytest.raises(ValueError, match="measured without keep_flow"):
-        lean.flow(0, 3)
+        lean.optical_flow(0, 3)
 
 
 def test_a_real_capture_has_moving_people_and_still_walls(tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ import av
 import numpy as np
 import pytest
 
-from packuv.scene.matroska import Decoder, Encoder, Packet, Reader, Spool, Track, write_matroska
+from packuv.scene.matroska import Decoder, Encoder, Packet, Reader, Spool, VideoTrack, write_matroska
 
-TRACKS = (Track("large", 256, 128, 16), Track("small", 96, 64, 6))
+TRACKS = (VideoTrack("large", 256, 128, 16), VideoTrack("small", 96, 64, 6))
 TIMES = {0: [0, 99, 1000], 1: [33, 66, 132, 700, 1033, 5000]}
 ATTACHMENTS = {
     "a.json": ("application/json", b'{"a": 1}'),

@@ -21,13 +21,21 @@ import packuv
 from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
-from packuv.scene import EncodeOptions, SceneHeader, VerifyReport, open_scene, verify_scene, write_scene
-from packuv.scene.encoder import TOLERANCES, Quality
-from packuv.scene.header import digest
+from packuv.scene import (
+    TOLERANCES,
+    EncodeOptions,
+    Quality,
+    SceneHeader,
+    Tolerance,
+    VerifyReport,
+    open_scene,
+    verify_scene,
+    write_scene,
+)
+from packuv.scene.header import codes_digest
 from packuv.scene.lookahead import Address
 from packuv.scene.matroska import Packet, write_matroska
 from packuv.scene.sharing import KeyPlanner, stored_segments
-from packuv.scene.stream import Tolerance
 from tests.support.places import ROOT
 
 DOCUMENT = ROOT / "docs/scene-format.md"
@@ -134,11 +142,20 @@ def test_every_frame_comes_back_in_any_order(tmp_path, seed, shapes, degree):
     summary = write_scene(tmp_path / "scene.mkv", save(tmp_path, segments), header, threads=1)
     assert summary.frames == len(frames)
     assert summary.bytes == (tmp_path / "scene.mkv").stat().st_size > sum(summary.track_bytes.values())
-    assert list(summary.digests) == [digest(codes) for codes in frames]
+    assert list(summary.digests) == [codes_digest(codes) for codes in frames]
     with open_scene(tmp_path / "scene.mkv", threads=1) as scene:
         assert len(scene) == len(frames)
         for frame in [*range(len(frames)), *np.random.default_rng(seed).integers(0, len(frames), 6).tolist()]:
             assert same(scene.codes(frame), frames[frame])
+
+
+def test_every_frame_is_in_the_segment_that_says_so(scene_file):
+    lengths = [frames for _, _, frames in SHAPES]
+    with open_scene(scene_file[0]) as scene:
+        assert [scene.segment_at(frame) for frame in range(21)] == np.repeat(np.arange(6), lengths).tolist()
+        for outside in (-1, 21):
+            with pytest.raises(IndexError, match="of a scene with 21 frames"):
+                scene.segment_at(outside)
 
 
 def test_constant_channels_and_a_still_scene_take_no_space(tmp_path):
@@ -409,9 +426,11 @@ def test_nothing_but_the_scene_is_left_behind(tmp_path):
 def test_progress_counts_every_frame_twice(tmp_path):
     steps = []
     segments = save(tmp_path, random_sequence(1, [(5, 5, 3), (5, 0, 2)]))
-    write_scene(
-        tmp_path / "scene.mkv", segments, make_header(5), progress=lambda done, total: steps.append((done, total))
-    )
+
+    def progress(done, total, note=""):
+        steps.append((done, total))
+
+    write_scene(tmp_path / "scene.mkv", segments, make_header(5), progress=progress)
     assert steps == [(done, 10) for done in range(1, 11)]
 
 
@@ -572,7 +591,8 @@ def rewritten(scene_file, tmp_path, change):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b'"version":2', b'"version":7', "it is packuv-scene version 7, layout compact; this program reads"),
+        (b'"version":2', b'"version":1', "it is packuv-scene version 1, layout compact; this program reads"),
+        (b'"version":2', b'"version":3', "it is packuv-scene version 3, layout compact; this program reads"),
         (b'"layout":"compact"', b'"layout":"compacT"', "layout compacT"),
         (b'"rows":300', b'"roWs":300', "lacks or misuses a field"),
         (b'"rows":300', b'"rows":1e9', "segment at frame 0 does not fit"),

@@ -41,7 +41,7 @@ def next_key(rng, key, kept, fresh):
     return Codes(np.concatenate([survivors.xyz, new.xyz]), np.concatenate([survivors.attributes, new.attributes]))
 
 
-def segment_of(rng, first, key, frames=2):
+def changed_segment(rng, first, key, frames=2):
     dynamic = rng.random(len(key)) < 0.3
     count = int(dynamic.sum())
     xyz = rng.integers(0, 65536, (frames - 1, count, 3)).astype(np.uint16)
@@ -56,7 +56,7 @@ def sequence(seed, sizes, kept, frames=2):
         key = random_codes(rng, fresh + 1) if key is None else next_key(rng, key, kept, fresh)
         if not len(key):
             key = random_codes(rng, 1)
-        result.append(segment_of(rng, number * frames, key, frames))
+        result.append(changed_segment(rng, number * frames, key, frames))
     return result
 
 
@@ -141,7 +141,7 @@ def test_what_did_not_change_is_not_stored_again():
     planner = KeyPlanner(4)
     plans = []
     for number in range(10):
-        plans.append(planner.plan(segment_of(rng, number, key)))
+        plans.append(planner.plan(changed_segment(rng, number, key)))
         changed = rng.permutation(5000)[:500]
         key = Codes(key.xyz.copy(), key.attributes.copy())
         key.attributes[changed, OPACITY] += 1
@@ -154,7 +154,7 @@ def test_an_aged_root_is_renewed():
     rng, planner = np.random.default_rng(0), KeyPlanner(2)
     key, plans = random_codes(rng, 2000), []
     for number in range(12):
-        plans.append(planner.plan(segment_of(rng, number, key)))
+        plans.append(planner.plan(changed_segment(rng, number, key)))
         key = next_key(rng, key, 0.9, 200)
     roots = [number for number, plan in enumerate(plans) if plan.reference is None]
     assert 2 <= len(roots) <= 4

@@ -25,17 +25,17 @@ from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, att
 from packuv.gaussians.segment import Segment
 from packuv.raster import RasterOptions, render
 from packuv.scene import SceneHeader, open_scene, write_scene
+from packuv.scene.mosaic import NEUTRAL
 from packuv.viewer.folder import WebOptions, checksum, read_deltas, read_index, read_video, write_web
 from packuv.viewer.streams import (
     MOST_PIXELS,
-    NEUTRAL,
     Sheet,
     StreamWriter,
     WebCodec,
     add_planes,
+    code_planes,
+    codes_of_planes,
     delta_planes,
-    key_codes,
-    key_planes,
     read_stream,
 )
 from tests.support.browser import Browser, running_browser
@@ -134,7 +134,7 @@ def test_pictures_stay_within_what_browsers_decode():
 def test_bytes_of_rows_add_up(count, degree, seed):
     rng = np.random.default_rng(seed)
     now, last = random_codes(rng, count, degree), random_codes(rng, count, degree)
-    assert same(key_codes(key_planes(now)), now)
+    assert same(codes_of_planes(code_planes(now)), now)
     assert same(add_planes(last, delta_planes(now, last)), now)
     assert (delta_planes(now, now) == NEUTRAL).all()
 

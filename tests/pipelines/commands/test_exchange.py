@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.importers import load_rig
-from packuv.atlas.video import AtlasVideo
+from packuv.atlas import AtlasVideo
 from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer
 from packuv.gaussians.floats import drawn

@@ -12,8 +12,7 @@ from packuv.fit.keyframe import KeyState
 from packuv.fit.start.bounds import Bounds
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
-from packuv.scene import EncodeOptions, SceneHeader, open_scene, write_scene
-from packuv.scene.stream import Tolerance
+from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
 from sync.align import AlignOptions, align
 from sync.timecode import Timecodes
 from tasks.artefacts.stage import Site
