@@ -71,7 +71,7 @@ def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def canonical(gaussians: Gaussians) -> Gaussians:
+def with_canonical_axes(gaussians: Gaussians) -> Gaussians:
     """The same ellipsoids with axes sorted by falling size, turned so that w is the quaternion's largest component.
 
     Of the 24 frames of an ellipsoid this one has w >= 0.5, so that x, y, z alone tell the rotation, and neighbouring

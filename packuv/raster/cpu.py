@@ -17,11 +17,11 @@ from packuv.gaussians.floats import Gaussians
 from packuv.kernels.compile import prefer_tbb
 from packuv.kernels.simd import WIDTH, Lanes, register_lanes
 from packuv.raster import bins, blend
+from packuv.raster.arena import Arena
 from packuv.raster.picture import Gradients, RasterOptions, checked_tiles, tile_shape
 from packuv.raster.project import CHUNKS, RECORD, project, project_backward
 from packuv.raster.sh import MAX_DEGREE
 from packuv.raster.view import TILE, view_constants
-from packuv.raster.workspace import Workspace
 
 BIN_CHUNKS = 16
 """Pieces of the depth order that are put into tiles side by side."""
@@ -35,7 +35,7 @@ class _Kept:
     view: np.ndarray
     sh_degree: int
     sums: Lanes
-    workspace: Workspace
+    arena: Arena
     record: np.ndarray  # float32 [N, 16]
     first_pair: np.ndarray  # int64 [N + 1]
     pairs: np.ndarray  # uint32 [P, 3]
@@ -85,7 +85,7 @@ def forward(
     background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     tiles: np.ndarray | None = None,
     weights: bool = False,
-    workspace: Workspace | None = None,
+    arena: Arena | None = None,
     sums: Lanes | None = None,
 ) -> Rendering:
     """Render N Gaussians.
@@ -98,13 +98,13 @@ def forward(
     prefer_tbb()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     _check(gaussians, degree)
-    sums, workspace = sums or register_lanes(), workspace or Workspace()
+    sums, arena = sums or register_lanes(), arena or Arena()
     active = checked_tiles(tiles, camera)
     view = view_constants(camera, options.near, options.low_pass_px2)
-    record, box, cells, invalid = _project(gaussians, degree, view, active, workspace)
-    visible, first_pair, pairs, start = _bin(record, box, cells, active, camera.height, workspace)
-    kept = _Kept(gaussians, view, degree, sums, workspace, record, first_pair, pairs, start,
-                 workspace.take(len(start) - 1, np.int64), workspace.take(len(start) - 1, np.int32))  # fmt: skip
+    record, box, cells, invalid = _project(gaussians, degree, view, active, arena)
+    visible, first_pair, pairs, start = _bin(record, box, cells, active, camera.height, arena)
+    kept = _Kept(gaussians, view, degree, sums, arena, record, first_pair, pairs, start,
+                 arena.take(len(start) - 1, np.int64), arena.take(len(start) - 1, np.int32))  # fmt: skip
     colour, depth, alpha, shares = _blend(kept, camera, np.asarray(background, np.float32), weights)
     return Rendering(colour, depth, alpha, visible, shares, invalid, kept)
 
@@ -123,18 +123,18 @@ def backward(
     change: for the others nothing is computed but the light that they take away.
     """
     kept = rendering._kept
-    gaussians, workspace, count = kept.gaussians, kept.workspace, len(kept.gaussians)
+    gaussians, arena, count = kept.gaussians, kept.arena, len(kept.gaussians)
     chosen = np.ones(count, np.uint8) if rows is None else _checked_rows(rows, count)
     pictures = [rendering.colour, rendering.depth, rendering.alpha]
     upstream = [_flat(d, p) for d, p in zip((d_colour, d_depth, d_alpha), pictures, strict=True)]
     height, width = rendering.alpha.shape
     pair_count = len(kept.pairs)
-    partial, used = workspace.take(pair_count * RECORD, np.float32), workspace.take(pair_count, np.uint8)
+    partial, used = arena.take(pair_count * RECORD, np.float32), arena.take(pair_count, np.uint8)
     blend.blend_backward(kept.sums, kept.record.reshape(-1), kept.pairs, kept.start, kept.used_end, -(-width // TILE),
                          width, height, *(p.reshape(-1) for p in pictures), *upstream, chosen, partial, used,
                          _jobs())  # fmt: skip
     shapes = [(count, 3), (count, 3), (count, 4), (count,), gaussians.sh.shape, (count, 2)]
-    out = [workspace.take(shape, np.float32) for shape in shapes]
+    out = [arena.take(shape, np.float32) for shape in shapes]
     overflown = np.empty(CHUNKS, np.int64)
     project_backward(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits,
                      gaussians.sh, kept.sh_degree, kept.view, kept.record, chosen, kept.first_pair, used,
@@ -174,23 +174,23 @@ def _flat(gradient: np.ndarray | None, picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(gradient, np.float32).reshape(-1)
 
 
-def _project(gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, workspace: Workspace
+def _project(gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, arena: Arena
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:  # fmt: skip
     """Records, boxes, tiles per box, and how many Gaussians are invalid."""
     count = len(gaussians)
     active_sum = np.zeros((active.shape[0] + 1, active.shape[1] + 1), np.int32)
     active_sum[1:, 1:] = active.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
-    record, box = workspace.take((count, RECORD), np.float32), workspace.take((count, 4), np.int32)
-    cells, invalid = workspace.take(count, np.int32), np.empty(CHUNKS, np.int64)
+    record, box = arena.take((count, RECORD), np.float32), arena.take((count, 4), np.int32)
+    cells, invalid = arena.take(count, np.int32), np.empty(CHUNKS, np.int64)
     project(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits, gaussians.sh,
             degree, view, active_sum, record, box, cells, invalid)  # fmt: skip
     return record, box, cells, int(invalid.sum())
 
 
 def _bin(record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndarray, height: int,
-         workspace: Workspace) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+         arena: Arena) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Tiles per Gaussian, first pair per Gaussian, pairs in tile and depth order, bounds of the tiles' lists."""
-    count, take = len(cells), workspace.take
+    count, take = len(cells), arena.take
     order, keys = [take(count, np.int32) for _ in range(2)], [take(count, np.float32) for _ in range(2)]
     drawn = bins.drawn(cells, record.reshape(-1), order[0], keys[0])
     bins.sort_by_depth(drawn, order[0], keys[0].view(np.uint32), order[1], keys[1].view(np.uint32),
@@ -210,7 +210,7 @@ def _bin(record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndar
 def _blend(kept: _Kept, camera: PinholeCamera, background: np.ndarray, weights: bool
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:  # fmt: skip
     """Colour, depth, alpha, and the blending weights if they are wanted."""
-    take, width, height = kept.workspace.take, camera.width, camera.height
+    take, width, height = kept.arena.take, camera.width, camera.height
     colour, depth, alpha = (
         take((3, height, width), np.float32),
         take((height, width), np.float32),

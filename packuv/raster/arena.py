@@ -18,7 +18,7 @@ class _Lease:
         }  # fmt: skip
 
 
-class Workspace:
+class Arena:
     """Memory for pictures and gradients, used again as soon as no array refers to it: a fit's memory stays flat.
 
     Serves one thread at a time. An array that it handed out stays valid as long as anyone holds it or a view of it.
