@@ -182,7 +182,7 @@ def _encode(means, log_scales, quaternions, opacity_logits, sh, centre, unit, ed
             attributes[i, 7 + k] = _step(sh[i, k], low[7 + k], per_step[7 + k])
 
 
-@kernel()
+@kernel(inner=True)
 def _step(value, low, per_step):
     return np.uint8(min(max(np.rint((np.float64(value) - low) * per_step), 0.0), 255.0))
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-DRAWN_LOGIT = -math.log(254)
-"""Logit of alpha 1/255: renderers skip Gaussians below it, and so the writers leave them out."""
+ALPHA_MIN = 1 / 255
+"""The alpha below which no renderer draws: a Gaussian in a pixel, and so a Gaussian whose opacity is less."""
+DRAWN_LOGIT = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
+"""Its logit: writers leave out what no renderer draws."""
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """SH basis function of band 0."""
 

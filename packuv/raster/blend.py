@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numba import prange
 
+from packuv.gaussians.floats import ALPHA_MIN
 from packuv.kernels.compile import kernel
 from packuv.kernels.simd import (
     ALL,
@@ -43,7 +44,7 @@ from packuv.kernels.simd import (
 )
 from packuv.raster.bins import GAUSSIAN, MASK, SLOT
 from packuv.raster.project import BLUE, DEPTH, EXPONENT_UNIT, GREEN, LOG_OPACITY, RECORD, RED, XX, XY, YY, X, Y
-from packuv.raster.view import ALPHA_MIN, TILE
+from packuv.raster.view import TILE
 
 _f32 = np.float32
 _TRANSMITTANCE_MIN = _f32(1e-4)
