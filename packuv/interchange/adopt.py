@@ -20,7 +20,8 @@ from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, SCALE, Codes, Quantiz
 from packuv.gaussians.floats import Gaussians, drawn, rows_of, with_canonical_axes
 from packuv.gaussians.rows import first_appearance, with_rows
 from packuv.gaussians.segment import Segment
-from packuv.gaussians.uvmap import UvOptions, assign_slots, choose_centre
+from packuv.gaussians.uvmap import assign_slots, choose_centre
+from packuv.gaussians.uvsize import UvOptions
 from packuv.interchange import is_splats, read_gaussians
 from packuv.interchange.joined import equal_codes, segments_of
 from packuv.interchange.orbit import OrbitOptions, likeness, near_of, orbit
