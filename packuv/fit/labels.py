@@ -111,14 +111,13 @@ def count_hits(
     if len(masks) != len(cameras) or (depths is not None and len(depths) != len(cameras)):
         raise ValueError(f"{len(cameras)} cameras need a mask each (or None), and a depth map each if any is given")
     shapes, visible = _shapes(gaussians), _visible(gaussians)
-    rule = np.array([options.sigmas, options.radius_limit_px, options.least_overlap, 1 + options.depth_tolerance,
-                     options.centres_only], dtype=np.float64)  # fmt: skip
-    nowhere = np.zeros((0, 0), np.float32)
+    limits = options.sigmas, options.radius_limit_px, options.least_overlap, 1 + options.depth_tolerance
+    rule = np.array([*limits, options.centres_only], dtype=np.float64)
     voters = (
-        (view_constants(camera, near, options.low_pass_px2), summed_area(_check_picture(mask, camera, "mask")),
-         nowhere if depth is None else np.ascontiguousarray(_check_picture(depth, camera, "depth"), np.float32))
-        for camera, mask, depth in zip(cameras, masks, depths or [None] * len(cameras), strict=True) if mask is not None
-    )  # fmt: skip
+        _voter(camera, mask, depth, near, options.low_pass_px2)
+        for camera, mask, depth in zip(cameras, masks, depths or [None] * len(cameras), strict=True)
+        if mask is not None
+    )
     if device != "cpu":
         from packuv.fit.labels_cuda import count_on_gpu
 
@@ -127,6 +126,16 @@ def count_hits(
     for view, table, depth in voters:
         _vote(gaussians.means, shapes, visible, view, table, depth, rule, hits, views)
     return hits, views
+
+
+def _voter(
+    camera: PinholeCamera, mask: np.ndarray, depth: np.ndarray | None, near: float, low_pass_px2: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A camera's view, the summed areas of its mask, and its depths, float32 [H, W], or [0, 0] where it has none."""
+    view, table = view_constants(camera, near, low_pass_px2), summed_area(_check_picture(mask, camera, "mask"))
+    if depth is None:
+        return view, table, np.zeros((0, 0), np.float32)
+    return view, table, np.ascontiguousarray(_check_picture(depth, camera, "depth"), np.float32)
 
 
 def active_tiles(
@@ -192,8 +201,12 @@ def _fill_shapes(quaternions, log_scales, out):
     count = len(out)
     for chunk in prange(CHUNKS):
         for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
-            w, x, y, z = (np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]),
-                          np.float64(quaternions[i, 3]))  # fmt: skip
+            w, x, y, z = (
+                np.float64(quaternions[i, 0]),
+                np.float64(quaternions[i, 1]),
+                np.float64(quaternions[i, 2]),
+                np.float64(quaternions[i, 3]),
+            )
             unit = 1 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
             rotation = _rotation(w * unit, x * unit, y * unit, z * unit)
             for k in range(9):

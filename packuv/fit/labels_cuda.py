@@ -30,8 +30,8 @@ def count_on_gpu(
         return hits, seen
     views, tables, depths = (list(part) for part in zip(*voters, strict=True))
     grid = -(-len(means) // _BLOCK[0]), -(-len(voters) // _BLOCK[1])
-    _kernel(opinion)[grid, _BLOCK](means, shapes, visible, np.stack(views), _stacked(tables), _sizes(tables),
-                                   _stacked(depths), _sizes(depths), rule, hits, seen)  # fmt: skip
+    pictures = _stacked(tables), _sizes(tables), _stacked(depths), _sizes(depths)
+    _kernel(opinion)[grid, _BLOCK](means, shapes, visible, np.stack(views), *pictures, rule, hits, seen)
     return hits, seen
 
 

@@ -35,10 +35,15 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        return round(self.sh.shape[1] ** 0.5) - 1
+        return round(math.sqrt(self.sh.shape[1])) - 1
 
 
 ATTRIBUTES = tuple(field.name for field in fields(Gaussians))
+
+
+def arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
+    """In the order of `ATTRIBUTES`; no copies."""
+    return tuple(getattr(gaussians, name) for name in ATTRIBUTES)
 
 
 def opacity(gaussians: Gaussians) -> np.ndarray:
@@ -48,18 +53,18 @@ def opacity(gaussians: Gaussians) -> np.ndarray:
 
 def logit(value: np.ndarray) -> np.ndarray:
     clipped = np.clip(value, 1e-6, 1 - 1e-6)
-    return np.log(clipped / (1 - clipped)).astype(np.float32)
+    return np.asarray(np.log(clipped / (1 - clipped)), dtype=np.float32)
 
 
 def drawn(gaussians: Gaussians) -> Gaussians:
     """Only those that a renderer would draw."""
     rows = gaussians.opacity_logits >= DRAWN_LOGIT
-    return Gaussians(*(getattr(gaussians, field.name)[rows] for field in fields(Gaussians)))
+    return Gaussians(*(array[rows] for array in arrays(gaussians)))
 
 
 def rows_of(gaussians: Gaussians, rows: np.ndarray | slice) -> Gaussians:
     """Some rows, by index or mask, as copies."""
-    return Gaussians(*(getattr(gaussians, name)[rows].copy() for name in ATTRIBUTES))
+    return Gaussians(*(array[rows].copy() for array in arrays(gaussians)))
 
 
 def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:

@@ -116,7 +116,7 @@ def choose_centre(
     if cameras is not None and len(cameras):
         candidates.append(cameras.mean(axis=0, dtype=np.float64))
     kept = [alpha[assign_slots(points, alpha, centre, options=options).kept].sum() for centre in candidates]
-    return candidates[int(np.argmax(kept))]
+    return np.asarray(candidates[int(np.argmax(kept))])
 
 
 @dataclass(frozen=True)

@@ -39,10 +39,19 @@ def render(
     shapes do not fit.
     """
     if options.device == "cpu":
-        return cpu.forward(gaussians, camera, options=options, sh_degree=sh_degree, background=background, tiles=tiles,
-                           weights=weights, arena=arena)  # fmt: skip
-    return _gsplat().forward(gaussians, camera, options=options, sh_degree=sh_degree, background=background,
-                             tiles=tiles, weights=weights)  # fmt: skip
+        return cpu.forward(
+            gaussians,
+            camera,
+            options=options,
+            sh_degree=sh_degree,
+            background=background,
+            tiles=tiles,
+            weights=weights,
+            arena=arena,
+        )
+    return _gsplat().forward(
+        gaussians, camera, options=options, sh_degree=sh_degree, background=background, tiles=tiles, weights=weights
+    )
 
 
 def gradients(
@@ -60,7 +69,8 @@ def gradients(
     """
     if isinstance(rendering, Rendering):
         return cpu.backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
-    return _gsplat().backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
+    found: Gradients = _gsplat().backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
+    return found
 
 
 def _gsplat() -> Any:

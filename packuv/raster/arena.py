@@ -13,9 +13,8 @@ class _Lease:
 
     def __init__(self, memory: np.ndarray, dtype: np.dtype, shape: tuple[int, ...]):
         address, read_only = memory.__array_interface__["data"]
-        self.__array_interface__ = {
-            "version": 3, "typestr": dtype.str, "shape": shape, "data": (address, read_only),
-        }  # fmt: skip
+        data = address, read_only
+        self.__array_interface__ = {"version": 3, "typestr": dtype.str, "shape": shape, "data": data}
 
 
 class Arena:

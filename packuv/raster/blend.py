@@ -331,14 +331,16 @@ def _start_tile(state, tile_x, tile_y, width, height, colour, depth, alpha, d_co
     for at in range(0, BLOCKS * WIDTH, WIDTH):
         x, y = x0 + int(state[_PIXEL_X + at]), y0 + int(state[_PIXEL_Y + at])
         if inside:
-            _start_vector(state, at, y * width + x, width, width * height, colour, depth, alpha,
-                          d_colour, d_depth, d_alpha)  # fmt: skip
+            _start_vector(
+                state, at, y * width + x, width, width * height, colour, depth, alpha, d_colour, d_depth, d_alpha
+            )
             continue
         for lane in range(WIDTH):
             px, py, to = x + (lane & 3), y + (lane >> 2), at + lane
             if px < width and py < height:
-                _start_pixel(state, to, py * width + px, width * height, colour, depth, alpha,
-                             d_colour, d_depth, d_alpha)  # fmt: skip
+                _start_pixel(
+                    state, to, py * width + px, width * height, colour, depth, alpha, d_colour, d_depth, d_alpha
+                )
             else:
                 for plane in range(0, _D_DEPTH + 1, _PLANE):
                     state[plane + to] = _f32(0)

@@ -146,8 +146,12 @@ def _project_one(means, log_scales, quaternions, logits, view, active_sum, recor
 @kernel(inline=True, fastmath=_FAST)
 def _unit(quaternions, i):
     """The unit quaternion, and one over the length of the given one."""
-    w, x, y, z = (np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]),
-                  np.float64(quaternions[i, 3]))  # fmt: skip
+    w, x, y, z = (
+        np.float64(quaternions[i, 0]),
+        np.float64(quaternions[i, 1]),
+        np.float64(quaternions[i, 2]),
+        np.float64(quaternions[i, 3]),
+    )
     inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
@@ -337,8 +341,9 @@ def project_backward(means, log_scales, quaternions, logits, sh, degree, view, r
             if rows[i] == 0 or not _sum_pairs(partial, used, first_pair[i], first_pair[i + 1], g):
                 _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i)
                 continue
-            x, y, z = _project_one_backward(means, log_scales, quaternions, logits, view, g, d_log_scales,
-                                            d_quaternions, d_logits, d_screen, i)  # fmt: skip
+            x, y, z = _project_one_backward(
+                means, log_scales, quaternions, logits, view, g, d_log_scales, d_quaternions, d_logits, d_screen, i
+            )
             cx, cy, cz = _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i)
             d_means[i, 0], d_means[i, 1], d_means[i, 2] = x + cx, y + cy, z + cz
             if not _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):

@@ -115,7 +115,8 @@ def _random_points(
 def random_ball(rng: np.random.Generator, count: int) -> np.ndarray:
     """Points evenly spread in the unit ball, float64 [count, 3]."""
     direction = rng.standard_normal((count, 3))
-    return direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(rng.random((count, 1)))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return direction * np.cbrt(rng.random((count, 1)))
 
 
 def neighbour_distance(points: np.ndarray) -> np.ndarray:

@@ -147,7 +147,7 @@ def interpolate(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         sums.append(_quartered(sums[-1]))
         weights.append(_quartered(weights[-1]))
     total = max(weights[-1].sum(), 1e-12)
-    mean = np.full_like(sums[-1], sums[-1].sum() / total)
+    mean: np.ndarray = np.full_like(sums[-1], sums[-1].sum() / total)
     for block_sum, block_weight in zip(reversed(sums), reversed(weights), strict=True):
         if mean.shape != block_sum.shape:
             mean = _doubled(mean)

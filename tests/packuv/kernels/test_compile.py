@@ -67,8 +67,8 @@ def test_a_constant_changed_in_another_file_is_seen_at_once(tmp_path):
 
     def probe() -> int:
         environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        done = subprocess.run([sys.executable, "-P", "-c", PROBE], env=environment, cwd=tmp_path, text=True,
-                              capture_output=True, timeout=300, check=False)  # fmt: skip
+        command = [sys.executable, "-P", "-c", PROBE]
+        done = subprocess.run(command, env=environment, cwd=tmp_path, text=True, capture_output=True, timeout=300)
         assert done.returncode == 0, done.stderr
         return int(done.stdout)
 

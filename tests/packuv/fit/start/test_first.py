@@ -97,8 +97,9 @@ def test_hull_points_lie_where_the_masks_meet(ring):
         (u, v), depth = camera.project(centre[None])[0][0], camera.project(centre[None])[1][0]
         masks.append(np.hypot(x - u, y - v) < radius * camera.fx / depth)
     pictures = [np.full((3, c.height, c.width), 0.5, np.float32) for c in cameras]
-    found = hull_points(cameras, pictures, masks, bounds=bounds, options=StartOptions(), count=400,
-                        rng=np.random.default_rng(0))  # fmt: skip
+    found = hull_points(
+        cameras, pictures, masks, bounds=bounds, options=StartOptions(), count=400, rng=np.random.default_rng(0)
+    )
     assert len(found.xyz) > 20
     # One camera in five may miss: the hull is a little wider than the ball.
     assert np.linalg.norm(found.xyz - centre, axis=1).max() < 1.8 * radius
