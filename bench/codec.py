@@ -32,7 +32,8 @@ import numpy as np
 from bench.made_up import SequenceOptions, find_gaussians, make_sequence
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer
 from packuv.gaussians.segment import Segment
-from packuv.gaussians.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
+from packuv.gaussians.uvmap import assign_slots, atlas_pixels, atlas_size
+from packuv.gaussians.uvsize import UvOptions
 from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, SceneHeader, open_scene, write_scene
 from packuv.scene.header import DYNAMIC, KEY
 from packuv.scene.matroska import Encoder, VideoTrack

@@ -16,7 +16,8 @@ import numpy as np
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, ROTATION, Quantizer, attribute_values
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
-from packuv.gaussians.uvmap import UvOptions, assign_slots
+from packuv.gaussians.uvmap import assign_slots
+from packuv.gaussians.uvsize import UvOptions
 from packuv.interchange import read_ply
 
 DATA = Path(os.environ.get("PACKUV_DATA", Path(__file__).parents[1] / "../shared/data"))

@@ -39,10 +39,10 @@ from packuv.gaussians.floats import Gaussians
 from packuv.interchange import read_ply
 from packuv.kernels.simd import fma, splat, sum_lanes
 from packuv.raster import (
+    Arena,
     Gradients,
     RasterOptions,
     Rendering,
-    Workspace,
     bins,
     blend,
     cpu,
@@ -162,7 +162,7 @@ class Iteration:
         rng = np.random.default_rng(options.seed)
         self.gaussians, self.camera, self.clock = gaussians, camera, clock
         self.target = rng.random((3, camera.height, camera.width)).astype(np.float32)
-        self.work, self.raster = Workspace(), RasterOptions(near=0.05, device=device)
+        self.work, self.raster = Arena(), RasterOptions(near=0.05, device=device)
         self.parameters = [getattr(gaussians, f.name).copy() for f in fields(Gaussians)]
         self.states = [AdamState.zeros(array) for array in self.parameters]
         self.times: dict[str, list[float]] = {name: [] for name in ("forward", "loss", "backward", "adam")}
@@ -171,7 +171,7 @@ class Iteration:
         """Render, compare, differentiate, step; the times go to `times`."""
         clock, times, target = self.clock, self.times, self.target
         drawn = timed(clock, times["forward"], render, self.gaussians, self.camera, options=self.raster,
-                      workspace=self.work, tiles=tiles)  # fmt: skip
+                      arena=self.work, tiles=tiles)  # fmt: skip
         loss = timed(
             clock, times["loss"], photometric_loss, drawn.colour, target, options=PhotometricOptions(), tiles=tiles
         )

@@ -39,7 +39,7 @@ class PinholeCamera:
     @property
     def centre(self) -> np.ndarray:
         """Where the camera stands, world, float64 [3]."""
-        return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+        return np.asarray(-self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3])
 
     @property
     def forward(self) -> np.ndarray:
@@ -83,9 +83,14 @@ class PinholeCamera:
         """Inverse of `to_json`; raises ValueError that names a missing field."""
         try:
             return cls(
-                str(data["name"]), int(data["width"]), int(data["height"]),
-                float(data["fx"]), float(data["fy"]), float(data["cx"]), float(data["cy"]),
+                str(data["name"]),
+                int(data["width"]),
+                int(data["height"]),
+                float(data["fx"]),
+                float(data["fy"]),
+                float(data["cx"]),
+                float(data["cy"]),
                 np.asarray(data["camera_from_world"], dtype=np.float64),
-            )  # fmt: skip
+            )
         except KeyError as missing:
             raise ValueError(f"a camera needs the field {missing}, but has {sorted(data)}") from None

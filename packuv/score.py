@@ -18,7 +18,7 @@ from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
 from packuv.metrics import psnr, ssim
 from packuv.progress import Progress
-from packuv.raster import RasterOptions, Workspace, render
+from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene
 
 
@@ -103,11 +103,11 @@ class Artist:
 
     def __init__(self, scene: Scene, device: str = "cpu") -> None:
         self._options = RasterOptions(near=float(scene.header.extra["near"]), device=device)
-        self._workspace = Workspace()
+        self._arena = Arena()
 
     def draw(self, gaussians: Gaussians, camera: PinholeCamera) -> np.ndarray:
         """float32 [3, H, W] in [0, 1], in the rig's common colour."""
-        rendering = render(gaussians, camera, options=self._options, workspace=self._workspace)
+        rendering = render(gaussians, camera, options=self._options, arena=self._arena)
         return np.clip(rendering.colour, 0, 1)
 
 

@@ -19,6 +19,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, NoReturn
 
+from packuv.gaussians.uvsize import UvOptions
 from pipelines.request import PRESETS, QUALITIES, STAGES
 
 OK, FAILED, WRONG, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -335,8 +336,10 @@ def _view(command: argparse.ArgumentParser) -> None:
 
 
 def _uv_map(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--map", type=_positive, default=1024, metavar="N", help="side of the UV map, texels")
-    command.add_argument("--layers", type=_positive, default=8, metavar="K", help="layers of the UV map")
+    command.add_argument(
+        "--map", type=_positive, default=UvOptions.rows, metavar="N", help="side of the UV map, texels"
+    )
+    command.add_argument("--layers", type=_positive, default=UvOptions.layers, metavar="K", help="layers of the UV map")
 
 
 def _output(command: argparse.ArgumentParser, metavar: str, text: str) -> None:

@@ -17,7 +17,8 @@ import numpy as np
 from packuv.files import whole_file
 from packuv.gaussians.codes import DC, OPACITY, REST, ROTATION, SCALE, Codes, Quantizer, attribute_count
 from packuv.gaussians.floats import SH_C0
-from packuv.gaussians.uvmap import UvOptions, assign_slots, atlas_pixels, atlas_size
+from packuv.gaussians.uvmap import assign_slots, atlas_pixels, atlas_size
+from packuv.gaussians.uvsize import UvOptions
 from packuv.scene import Scene
 
 POSITION_HI, POSITION_LO, OPACITIES = "position_hi", "position_lo", "opacity"

@@ -13,7 +13,7 @@ import numpy as np
 from packuv.atlas.picture import filled, read_triplets
 from packuv.atlas.video import AtlasVideo
 from packuv.gaussians.codes import Codes
-from packuv.gaussians.rows import segment_of
+from packuv.gaussians.rows import joined_segment
 from packuv.gaussians.segment import Segment
 from packuv.progress import Progress, no_progress, part_of
 from packuv.scene import write_scene
@@ -77,4 +77,4 @@ def _segments(video: AtlasVideo, tally: _Tally, progress: Callable[[int], None])
             texels.append(np.flatnonzero(filled(triplets)))
             progress(tally.frames)
         used = np.unique(np.concatenate(texels))
-        yield segment_of(first, frames, [np.searchsorted(used, texel) for texel in texels])
+        yield joined_segment(first, frames, [np.searchsorted(used, texel) for texel in texels])

@@ -34,7 +34,7 @@ from packuv.atlas.picture import (
 )
 from packuv.files import whole_file
 from packuv.gaussians.codes import OPACITY, Codes
-from packuv.gaussians.uvmap import UvOptions
+from packuv.gaussians.uvsize import UvOptions
 from packuv.progress import Progress, no_progress
 from packuv.scene import Scene, SceneHeader, open_scene
 from packuv.scene.header import codes_digest

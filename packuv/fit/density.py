@@ -13,7 +13,8 @@ import numpy as np
 from packuv.fit.model import Model
 from packuv.fit.start.bounds import Bounds
 from packuv.gaussians.floats import Gaussians, logit, opacity, rotation_matrices, rows_of
-from packuv.gaussians.uvmap import UvOptions, assign_slots
+from packuv.gaussians.uvmap import assign_slots
+from packuv.gaussians.uvsize import UvOptions
 
 SHRINK = np.float32(np.log(1.6))
 """Logarithm of how much smaller the halves of a split Gaussian are, as in 3D Gaussian Splatting"""

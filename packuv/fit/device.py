@@ -7,6 +7,7 @@ the CPU is refused, whatever the cause: an old driver, another version of gsplat
 from __future__ import annotations
 
 import importlib.util
+from typing import Any
 
 import numpy as np
 
@@ -40,9 +41,10 @@ def obstacle() -> str | None:
     """What keeps this machine from using a GPU; None where nothing does. The first time gsplat compiles for minutes."""
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed (pip install 'packuv[cuda]')"
+    import numba.cuda
     import torch
-    from numba import cuda
 
+    cuda: Any = numba.cuda
     if not torch.cuda.is_available() or not cuda.is_available():
         return "torch or numba finds no CUDA device"
     try:

@@ -31,11 +31,11 @@ from packuv.fit.start.points import Points, drawn, no_points
 from packuv.fit.start.shell import Shell, sweep_shell
 from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY_RANGE, Quantizer, attribute_values
-from packuv.gaussians.floats import ATTRIBUTES, Gaussians, canonical
+from packuv.gaussians.floats import ATTRIBUTES, Gaussians, with_canonical_axes
 from packuv.motion import Still
 from packuv.motion.step import MotionOptions, difference
 from packuv.progress import Progress, Ticks, no_progress
-from packuv.raster import RasterOptions, Workspace, render
+from packuv.raster import Arena, RasterOptions, render
 
 DEAD_CODE = 1
 """Opacity codes up to this one decode below 1/255, which no renderer draws"""
@@ -119,7 +119,7 @@ def fit_first(
         shots = first
     solver.run(shots, floating - solver.done, of=total, grow_from=options.start.count, ticks=ticks)
     solver.keep(solver.worth_keeping())
-    model.gaussians = canonical(model.gaussians)
+    model.gaussians = with_canonical_axes(model.gaussians)
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
     degree = needed_degree(model.gaussians, shots, near=bounds.near, options=options)
     model.limit_sh(degree)
@@ -211,11 +211,11 @@ def _surface(shell: Shell | None, points: Points | None, options: FirstOptions) 
 def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, options: FirstOptions) -> int:
     """The lowest SH degree whose pictures are nearly as good as those of all bands: view dependence that a scene does
     not show is not carried. Nothing is fitted again, so a band that helps is kept rather than lost."""
-    full, workspace, raster = options.sh_degree, Workspace(), RasterOptions(near, device=options.device)
+    full, arena, raster = options.sh_degree, Arena(), RasterOptions(near, device=options.device)
 
     def loss(degree: int) -> float:
         cut = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
-        drawn = (render(cut, s.camera, options=raster, workspace=workspace).colour for s in shots)
+        drawn = (render(cut, s.camera, options=raster, arena=arena).colour for s in shots)
         values = [photometric_loss(picture, shot.target, options=options.photometric).value
                   for picture, shot in zip(drawn, shots, strict=True)]  # fmt: skip
         return float(np.mean(values))
@@ -264,7 +264,7 @@ def _hull_gaussians(
     spacing = neighbour_distance(points.xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 0.02 * bounds.radius)
     born = round_gaussians(points.xyz, points.rgb, scale, opacity=options.start.opacity, sh_degree=sh_degree)
-    return canonical(born)
+    return with_canonical_axes(born)
 
 
 def _figures(started: float, losses: Losses, solver: Solver) -> dict[str, Any]:

@@ -16,15 +16,24 @@ import numpy as np
 from numba import prange
 
 from packuv.camera import PinholeCamera
-from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.floats import ALPHA_MIN, DRAWN_LOGIT, Gaussians, opacity
 from packuv.kernels.compile import kernel, prefer_tbb
-from packuv.raster.view import MARGIN, TILE
+from packuv.raster import ewa
+from packuv.raster.view import (
+    TILE,
+    VIEW_CX,
+    VIEW_CY,
+    VIEW_FX,
+    VIEW_FY,
+    VIEW_HEIGHT,
+    VIEW_LOW_PASS,
+    VIEW_NEAR,
+    VIEW_WIDTH,
+    view_constants,
+)
 
 CHUNKS = 64
 """Pieces of work, whatever the number of threads."""
-
-LEAST_OPACITY = 1 / 255
-"""Renderers skip a Gaussian that is fainter, so it touches nothing."""
 
 
 @dataclass(frozen=True)
@@ -101,23 +110,32 @@ def count_hits(
     """
     if len(masks) != len(cameras) or (depths is not None and len(depths) != len(cameras)):
         raise ValueError(f"{len(cameras)} cameras need a mask each (or None), and a depth map each if any is given")
-    covariance, visible = _world_covariance(gaussians), _visible(gaussians)
-    rule = np.array([options.sigmas, options.radius_limit_px, options.least_overlap, 1 + options.depth_tolerance,
-                     options.centres_only], dtype=np.float64)  # fmt: skip
-    nowhere = np.zeros((0, 0), np.float32)
+    shapes, visible = _shapes(gaussians), _visible(gaussians)
+    limits = options.sigmas, options.radius_limit_px, options.least_overlap, 1 + options.depth_tolerance
+    rule = np.array([*limits, options.centres_only], dtype=np.float64)
     voters = (
-        (_view(camera, near, options.low_pass_px2), summed_area(_check_picture(mask, camera, "mask")),
-         nowhere if depth is None else np.ascontiguousarray(_check_picture(depth, camera, "depth"), np.float32))
-        for camera, mask, depth in zip(cameras, masks, depths or [None] * len(cameras), strict=True) if mask is not None
-    )  # fmt: skip
+        _voter(camera, mask, depth, near, options.low_pass_px2)
+        for camera, mask, depth in zip(cameras, masks, depths or [None] * len(cameras), strict=True)
+        if mask is not None
+    )
     if device != "cpu":
         from packuv.fit.labels_cuda import count_on_gpu
 
-        return count_on_gpu(_opinion, gaussians.means, covariance, visible, list(voters), rule)
+        return count_on_gpu(_opinion, gaussians.means, shapes, visible, list(voters), rule)
     hits, views = np.zeros(len(gaussians), dtype=np.int32), np.zeros(len(gaussians), dtype=np.int32)
     for view, table, depth in voters:
-        _vote(gaussians.means, covariance, visible, view, table, depth, rule, hits, views)
+        _vote(gaussians.means, shapes, visible, view, table, depth, rule, hits, views)
     return hits, views
+
+
+def _voter(
+    camera: PinholeCamera, mask: np.ndarray, depth: np.ndarray | None, near: float, low_pass_px2: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A camera's view, the summed areas of its mask, and its depths, float32 [H, W], or [0, 0] where it has none."""
+    view, table = view_constants(camera, near, low_pass_px2), summed_area(_check_picture(mask, camera, "mask"))
+    if depth is None:
+        return view, table, np.zeros((0, 0), np.float32)
+    return view, table, np.ascontiguousarray(_check_picture(depth, camera, "depth"), np.float32)
 
 
 def active_tiles(
@@ -139,9 +157,8 @@ def active_tiles(
     _check_picture(mask, camera, "mask")
     padded = np.pad(mask, ((0, rows * TILE - camera.height), (0, columns * TILE - camera.width)))
     tiles = np.asarray(padded.reshape(rows, TILE, columns, TILE).any(axis=(1, 3)))
-    opacity = 1 / (1 + np.exp(-moving.opacity_logits.astype(np.float64)))
-    reach = np.sqrt(2 * np.log(np.maximum(255 * opacity, 1)))  # in standard deviations, [N]
-    _touch(moving.means, _world_covariance(moving), _visible(moving), reach, _view(camera, near, low_pass_px2), tiles)
+    reach = np.sqrt(2 * np.log(np.maximum(opacity(moving) * (1 / ALPHA_MIN), 1)))  # in standard deviations, [N]
+    _touch(moving.means, _shapes(moving), _visible(moving), reach, view_constants(camera, near, low_pass_px2), tiles)
     return tiles
 
 
@@ -162,78 +179,57 @@ def _check_picture(picture: np.ndarray, camera: PinholeCamera, name: str) -> np.
 
 def _visible(gaussians: Gaussians) -> np.ndarray:
     """Gaussians that renderers draw at all, bool [N]."""
-    return np.asarray(gaussians.opacity_logits >= -math.log(1 / LEAST_OPACITY - 1))
+    return np.asarray(gaussians.opacity_logits >= DRAWN_LOGIT)
 
 
-def _world_covariance(gaussians: Gaussians) -> np.ndarray:
-    """xx xy xz yy yz zz of R S S R^T, world, float64 [N, 6]."""
+def _shapes(gaussians: Gaussians) -> np.ndarray:
+    """Rotation by rows and the three standard deviations, world, float64 [N, 12]."""
     prefer_tbb()
-    out = np.empty((len(gaussians), 6))
-    _covariances(gaussians.quaternions, gaussians.log_scales, out)
+    out = np.empty((len(gaussians), 12))
+    _fill_shapes(gaussians.quaternions, gaussians.log_scales, out)
     return out
 
 
+_in_camera, _linear_map, _rotation, _screen_axes, _covariance = (
+    kernel(inline=True)(function)
+    for function in (ewa.in_camera, ewa.linear_map, ewa.rotation, ewa.screen_axes, ewa.covariance)
+)
+
+
 @kernel(parallel=True)
-def _covariances(quaternions, log_scales, out):
+def _fill_shapes(quaternions, log_scales, out):
     count = len(out)
     for chunk in prange(CHUNKS):
         for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
-            w, x, y, z = (np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]),
-                          np.float64(quaternions[i, 3]))  # fmt: skip
+            w, x, y, z = (
+                np.float64(quaternions[i, 0]),
+                np.float64(quaternions[i, 1]),
+                np.float64(quaternions[i, 2]),
+                np.float64(quaternions[i, 3]),
+            )
             unit = 1 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-            w, x, y, z = w * unit, x * unit, y * unit, z * unit
-            out[i] = 0
+            rotation = _rotation(w * unit, x * unit, y * unit, z * unit)
+            for k in range(9):
+                out[i, k] = rotation[k]
             for axis in range(3):
-                if axis == 0:
-                    a, b, c = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
-                elif axis == 1:
-                    a, b, c = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
-                else:
-                    a, b, c = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
-                variance = math.exp(2 * np.float64(log_scales[i, axis]))
-                out[i, 0] += variance * a * a
-                out[i, 1] += variance * a * b
-                out[i, 2] += variance * a * c
-                out[i, 3] += variance * b * b
-                out[i, 4] += variance * b * c
-                out[i, 5] += variance * c * c
+                out[i, 9 + axis] = math.exp(np.float64(log_scales[i, axis]))
 
 
-def _view(camera: PinholeCamera, near: float, low_pass_px2: float) -> np.ndarray:
-    """What the kernels need of a camera, float64 [24]: rotation 0-8, translation 9-11, fx fy cx cy 12-15, width and
-    height 16-17, limits of x/z and y/z 18-21, near 22, low pass 23. Beyond the limits the renderer, too, takes the
-    projection's linear map at the limit."""
-    width, height = camera.width, camera.height
-    return np.array([
-        *camera.camera_from_world[:3, :3].ravel(), *camera.camera_from_world[:3, 3],
-        camera.fx, camera.fy, camera.cx, camera.cy, width, height,
-        (-MARGIN * width - camera.cx) / camera.fx, ((1 + MARGIN) * width - camera.cx) / camera.fx,
-        (-MARGIN * height - camera.cy) / camera.fy, ((1 + MARGIN) * height - camera.cy) / camera.fy,
-        near, low_pass_px2,
-    ], dtype=np.float64)  # fmt: skip
-
-
-@kernel()
-def _project(means, covariance, view, i):
+@kernel(inner=True)
+def _project(means, shapes, view, i):
     """Pixel x and y of the centre, its depth, xx xy yy of the covariance in the picture; depth 0 if it has none."""
-    px, py, pz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-    x = view[0] * px + view[1] * py + view[2] * pz + view[9]
-    y = view[3] * px + view[4] * py + view[5] * pz + view[10]
-    z = view[6] * px + view[7] * py + view[8] * pz + view[11]
-    if not (z > 0 and z >= view[22]):
+    x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
+    if not (z > 0 and z >= view[VIEW_NEAR]):
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    slope_x, slope_y = min(max(x / z, view[18]), view[19]), min(max(y / z, view[20]), view[21])
-    a, b = view[12] / z, view[13] / z
-    u0, u1, u2 = a * (view[0] - slope_x * view[6]), a * (view[1] - slope_x * view[7]), a * (view[2] - slope_x * view[8])
-    v0, v1, v2 = b * (view[3] - slope_y * view[6]), b * (view[4] - slope_y * view[7]), b * (view[5] - slope_y * view[8])
-    c = covariance[i]
-    s0, s1, s2 = c[0] * u0 + c[1] * u1 + c[2] * u2, c[1] * u0 + c[3] * u1 + c[4] * u2, c[2] * u0 + c[4] * u1 + c[5] * u2
-    t0, t1, t2 = c[0] * v0 + c[1] * v1 + c[2] * v2, c[1] * v0 + c[3] * v1 + c[4] * v2, c[2] * v0 + c[4] * v1 + c[5] * v2
-    xx, xy, yy = u0 * s0 + u1 * s1 + u2 * s2, u0 * t0 + u1 * t1 + u2 * t2, v0 * t0 + v1 * t1 + v2 * t2
-    return view[12] * x / z + view[14], view[13] * y / z + view[15], z, xx + view[23], xy, yy + view[23]
+    inverse_z = 1 / z
+    u, v = x * inverse_z, y * inverse_z
+    _, axes = _linear_map(view, u, v, inverse_z)
+    shape = shapes[i]
+    xx, xy, yy, _ = _covariance(_screen_axes(axes, shape, shape[9], shape[10], shape[11]), view[VIEW_LOW_PASS])
+    return view[VIEW_FX] * u + view[VIEW_CX], view[VIEW_FY] * v + view[VIEW_CY], z, xx, xy, yy
 
 
-@kernel()
+@kernel(inner=True)
 def _row_span(x, y, xx, xy, yy, square, limit, width, row):
     """Pixels of a row, half-open, whose centres lie in the ellipse d^2 <= square and within `limit`."""
     dy = row + 0.5 - y
@@ -246,14 +242,14 @@ def _row_span(x, y, xx, xy, yy, square, limit, width, row):
     return int(max(math.ceil(low - 0.5), 0.0)), int(min(math.floor(high - 0.5) + 1.0, width))
 
 
-@kernel()
+@kernel(inner=True)
 def _rows(y, yy, sigmas, limit, height):
     """First row, and the one past the last, that an ellipse reaches."""
     half = min(sigmas * math.sqrt(yy), limit)
     return int(max(math.ceil(y - half - 0.5), 0.0)), int(min(math.floor(y + half - 0.5) + 1.0, height))
 
 
-@kernel()
+@kernel(inner=True)
 def _overlap(x, y, xx, xy, yy, sigmas, limit, table):
     """Pixels of the ellipse that are in the picture, and those of them that are in the mask."""
     height, width = table.shape[0] - 1, table.shape[1] - 1
@@ -267,7 +263,7 @@ def _overlap(x, y, xx, xy, yy, sigmas, limit, table):
     return inside, masked
 
 
-@kernel()
+@kernel(inner=True)
 def _box_is_clear(x, y, xx, yy, sigmas, limit, table):
     """Whether no masked pixel lies in the ellipse's bounding box."""
     height, width = table.shape[0] - 1, table.shape[1] - 1
@@ -278,7 +274,7 @@ def _box_is_clear(x, y, xx, yy, sigmas, limit, table):
     return table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left] == 0
 
 
-@kernel()
+@kernel(inner=True)
 def _is_hidden(x, y, z, depth, slack):
     row, column = math.floor(y), math.floor(x)
     if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
@@ -286,7 +282,7 @@ def _is_hidden(x, y, z, depth, slack):
     return depth[row, column] > 0 and z > depth[row, column] * slack
 
 
-@kernel()
+@kernel(inner=True)
 def _is_hit(x, y, xx, xy, yy, rule, table):
     """Whether the mask holds enough of an ellipse; `rule` as in `_vote`."""
     sigmas, limit, least_overlap = rule[0], rule[1], rule[2]
@@ -296,51 +292,51 @@ def _is_hit(x, y, xx, xy, yy, rule, table):
     return masked > 0 and masked >= least_overlap * inside
 
 
-@kernel()
+@kernel(inner=True)
 def _pixel(x, y, table):
     """Whether the pixel under a point in the picture is in the mask."""
     row, column = math.floor(y), math.floor(x)
     return table[row + 1, column + 1] - table[row, column + 1] - table[row + 1, column] + table[row, column] > 0
 
 
-@kernel()
-def _opinion(means, covariance, view, table, depth, rule, i):
+@kernel(inner=True)
+def _opinion(means, shapes, view, table, depth, rule, i):
     """One camera of one Gaussian: whether it sees it, and whether its mask is hit as well.
 
     `rule`, float64 [5]: sigmas, radius limit, least overlap, depth slack, and whether only centres count.
     """
-    x, y, z, xx, xy, yy = _project(means, covariance, view, i)
+    x, y, z, xx, xy, yy = _project(means, shapes, view, i)
     # Algorithm 4, step 3; the comparisons also refuse what is not a number.
     if not (z > 0 and xx * yy - xy * xy > 1e-7 and abs(x) < 1e9 and abs(y) < 1e9):
         return False, False
     if _is_hidden(x, y, z, depth, rule[3]):
         return False, False
-    centred = 0 <= x < view[16] and 0 <= y < view[17]
+    centred = 0 <= x < view[VIEW_WIDTH] and 0 <= y < view[VIEW_HEIGHT]
     hit = centred and _pixel(x, y, table) if rule[4] else _is_hit(x, y, xx, xy, yy, rule, table)
     return centred or hit, hit
 
 
 @kernel(parallel=True)
-def _vote(means, covariance, visible, view, table, depth, rule, hits, views):
+def _vote(means, shapes, visible, view, table, depth, rule, hits, views):
     """Add one camera's opinion: `views` [N] grows where it sees a Gaussian, `hits` [N] where its mask is hit too."""
     count = len(means)
     for chunk in prange(CHUNKS):
         for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
             if visible[i]:
-                seen, hit = _opinion(means, covariance, view, table, depth, rule, i)
+                seen, hit = _opinion(means, shapes, view, table, depth, rule, i)
                 views[i] += seen
                 hits[i] += hit
 
 
 @kernel(parallel=True)
-def _touch(means, covariance, visible, reach, view, tiles):
+def _touch(means, shapes, visible, reach, view, tiles):
     """Set the tiles, bool [rows, columns], that hold a pixel of an ellipse of `reach` [N] standard deviations."""
-    width, height = int(view[16]), int(view[17])
+    width, height = int(view[VIEW_WIDTH]), int(view[VIEW_HEIGHT])
     for chunk in prange(CHUNKS):
         for i in range(len(means) * chunk // CHUNKS, len(means) * (chunk + 1) // CHUNKS):
             if not visible[i]:
                 continue
-            x, y, z, xx, xy, yy = _project(means, covariance, view, i)
+            x, y, z, xx, xy, yy = _project(means, shapes, view, i)
             if not (z > 0 and xx * yy - xy * xy > 0 and abs(x) < 1e9 and abs(y) < 1e9):
                 continue
             first, end = _rows(y, yy, reach[i], 1e9, height)

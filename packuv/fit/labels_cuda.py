@@ -16,7 +16,7 @@ _BLOCK = 32, 8
 def count_on_gpu(
     opinion: Callable[..., tuple[bool, bool]],
     means: np.ndarray,
-    covariance: np.ndarray,
+    shapes: np.ndarray,
     visible: np.ndarray,
     voters: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
     rule: np.ndarray,
@@ -30,8 +30,8 @@ def count_on_gpu(
         return hits, seen
     views, tables, depths = (list(part) for part in zip(*voters, strict=True))
     grid = -(-len(means) // _BLOCK[0]), -(-len(voters) // _BLOCK[1])
-    _kernel(opinion)[grid, _BLOCK](means, covariance, visible, np.stack(views), _stacked(tables), _sizes(tables),
-                                   _stacked(depths), _sizes(depths), rule, hits, seen)  # fmt: skip
+    pictures = _stacked(tables), _sizes(tables), _stacked(depths), _sizes(depths)
+    _kernel(opinion)[grid, _BLOCK](means, shapes, visible, np.stack(views), *pictures, rule, hits, seen)
     return hits, seen
 
 
@@ -53,13 +53,13 @@ def _kernel(opinion: Callable[..., tuple[bool, bool]]) -> Any:
     """A thread for each Gaussian and view."""
 
     @cuda.jit
-    def vote_all(means, covariance, visible, views, tables, table_sizes, depths, depth_sizes, rule, hits, seen):
+    def vote_all(means, shapes, visible, views, tables, table_sizes, depths, depth_sizes, rule, hits, seen):
         i, c = cuda.grid(2)
         if i >= means.shape[0] or c >= views.shape[0] or not visible[i]:
             return
         table = tables[c, : table_sizes[c, 0], : table_sizes[c, 1]]
         depth = depths[c, : depth_sizes[c, 0], : depth_sizes[c, 1]]
-        saw, hit = opinion(means, covariance, views[c], table, depth, rule, i)
+        saw, hit = opinion(means, shapes, views[c], table, depth, rule, i)
         if saw:
             cuda.atomic.add(seen, i, 1)
         if hit:

@@ -16,7 +16,7 @@ from packuv.fit.losses import PhotometricOptions
 from packuv.fit.model import Rates
 from packuv.fit.start.first import StartOptions
 from packuv.fit.start.shell import ShellOptions
-from packuv.gaussians.uvmap import UvOptions
+from packuv.gaussians.uvsize import UvOptions
 from packuv.motion import BackgroundOptions
 
 Part = TypeVar("Part", bound="SolverOptions")

@@ -15,7 +15,7 @@ from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
-from packuv.raster import RasterOptions, Workspace, render
+from packuv.raster import Arena, RasterOptions, render
 
 
 def seam(key: KeyState, segment: Segment, after: KeyState, views: Views) -> float:
@@ -29,10 +29,10 @@ def seam(key: KeyState, segment: Segment, after: KeyState, views: Views) -> floa
     last = segment.first + len(segment) - 1
     codes = [segment.frame(len(segment) - 2), segment.frame(len(segment) - 1), key.quantizer.encode(after.gaussians)]
     shown = [key.quantizer.decode(part) for part in codes]
-    workspace, inside, across = Workspace(), [], []
+    arena, inside, across = Arena(), [], []
     for index in range(len(views.cameras)):
         before, middle, border = (
-            _error(gaussians, views, index, instant, key.bounds.near, workspace)
+            _error(gaussians, views, index, instant, key.bounds.near, arena)
             for gaussians, instant in zip(shown, (last - 1, last, last + 1), strict=True)
         )
         if before is not None and middle is not None and border is not None:
@@ -51,11 +51,11 @@ def tail(key: KeyState, segment: Segment) -> KeyState:
 
 
 def _error(
-    gaussians: Gaussians, views: Views, index: int, instant: int, near: float, workspace: Workspace
+    gaussians: Gaussians, views: Views, index: int, instant: int, near: float, arena: Arena
 ) -> np.ndarray | None:
     """Render minus picture, float32 [3, H, W]; None where the camera has no picture."""
     picture = views.picture(index, instant)
     if picture is None:
         return None
-    drawn = render(gaussians, views.cameras[index], options=RasterOptions(near), workspace=workspace)
+    drawn = render(gaussians, views.cameras[index], options=RasterOptions(near), arena=arena)
     return np.clip(drawn.colour, 0, 1) - picture

@@ -19,7 +19,7 @@ from packuv.footage import Views
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity, rows_of
 from packuv.progress import Ticks
-from packuv.raster import Gradients, RasterOptions, Rendering, Workspace, gradients, render
+from packuv.raster import Arena, Gradients, RasterOptions, Rendering, gradients, render
 
 _VOID = 16 / 255
 """A pixel whose channels are all below may show nothing: decoded black is not quite black"""
@@ -55,7 +55,7 @@ class Solver:
         self._options = options
         self._rng = rng
         self._order: list[int] = []
-        self._workspace = Workspace()
+        self._arena = Arena()
         self._guard = Guard(model, bounds)
         self._overflown = 0
         self.done = 0
@@ -94,7 +94,7 @@ class Solver:
         if excess <= 0:
             return
         drawn, raster = self._decoded(), RasterOptions(self.bounds.near, device=self._options.device)
-        shown = [render(drawn, shot.camera, options=raster, weights=True, workspace=self._workspace).weights
+        shown = [render(drawn, shot.camera, options=raster, weights=True, arena=self._arena).weights
                  for shot in shots]  # fmt: skip
         rows, stays = np.flatnonzero(self.rows), np.ones(len(self.model), bool)
         stays[rows[np.argsort(np.sum(shown, axis=0)[rows], kind="stable")[:excess]]] = False
@@ -171,7 +171,7 @@ class Solver:
     def _iterate(self, shot: Shot, near: float, *, progress: float, scale: float = 1.0, opaque: bool = False) -> Losses:
         options = self._options
         raster = RasterOptions(near, device=options.device)
-        rendering = render(self._decoded(), shot.camera, options=raster, tiles=shot.tiles, workspace=self._workspace)
+        rendering = render(self._decoded(), shot.camera, options=raster, tiles=shot.tiles, arena=self._arena)
         moving = self.rows & (rendering.visible > 0)
         behind = self._behind(shot.target) if opaque else None
         picture = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind

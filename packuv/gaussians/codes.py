@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.floats import Gaussians, arrays
 from packuv.kernels.compile import kernel
 
 SCALE = slice(0, 3)
@@ -93,21 +93,21 @@ class Quantizer:
     def xyz_table(self) -> np.ndarray:
         """float32 [3, 65536]: position of each code."""
         t = (np.arange(65536) / 32767.5 - 1.0) * self._edge[:, None]
-        return (self.centre[:, None] + np.sign(t) * self.unit * np.expm1(np.abs(t))).astype(np.float32)
+        return np.asarray(self.centre[:, None] + np.sign(t) * self.unit * np.expm1(np.abs(t)), dtype=np.float32)
 
     @cached_property
     def attribute_table(self) -> np.ndarray:
         """float32 [A, 256]: value of each code."""
         step = (self.high - self.low) / 255
-        return (self.low[:, None] + np.arange(256) * step[:, None]).astype(np.float32)
+        return np.asarray(self.low[:, None] + np.arange(256) * step[:, None], dtype=np.float32)
 
     def encode(self, gaussians: Gaussians) -> Codes:
         """Nearest codes; values outside their range saturate, see `saturation`."""
         count, columns = len(gaussians), len(self.low)
         xyz, attributes = np.empty((count, 3), np.uint16), np.empty((count, columns), np.uint8)
-        _encode(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits,
-                gaussians.sh.reshape(count, -1), self.centre, self.unit, self._edge, self.low,
-                255 / (self.high - self.low), xyz, attributes)  # fmt: skip
+        flat, scale = gaussians.sh.reshape(count, -1), 255 / (self.high - self.low)
+        place = self.centre, self.unit, self._edge
+        _encode(*arrays(gaussians)[:4], flat, *place, self.low, scale, xyz, attributes)
         return Codes(xyz, attributes)
 
     def decode(self, codes: Codes, *, into: Gaussians | None = None) -> Gaussians:
@@ -118,8 +118,8 @@ class Quantizer:
         if into is None:
             shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, coefficients, 3)]
             into = Gaussians(*(np.empty(shape, np.float32) for shape in shapes))
-        _decode(codes.xyz, codes.attributes, self.xyz_table, self.attribute_table, into.means, into.log_scales,
-                into.quaternions, into.opacity_logits, into.sh.reshape(len(into), -1))  # fmt: skip
+        tables, flat = (self.xyz_table, self.attribute_table), into.sh.reshape(len(into), -1)
+        _decode(codes.xyz, codes.attributes, *tables, *arrays(into)[:4], flat)
         return into
 
     def saturation(self, gaussians: Gaussians) -> int:
@@ -182,7 +182,7 @@ def _encode(means, log_scales, quaternions, opacity_logits, sh, centre, unit, ed
             attributes[i, 7 + k] = _step(sh[i, k], low[7 + k], per_step[7 + k])
 
 
-@kernel()
+@kernel(inner=True)
 def _step(value, low, per_step):
     return np.uint8(min(max(np.rint((np.float64(value) - low) * per_step), 0.0), 255.0))
 

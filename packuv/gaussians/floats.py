@@ -7,8 +7,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-DRAWN_LOGIT = -math.log(254)
-"""Logit of alpha 1/255: renderers skip Gaussians below it, and so the writers leave them out."""
+ALPHA_MIN = 1 / 255
+"""The alpha below which no renderer draws: a Gaussian in a pixel, and so a Gaussian whose opacity is less."""
+DRAWN_LOGIT = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
+"""Its logit: writers leave out what no renderer draws."""
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """SH basis function of band 0."""
 
@@ -33,10 +35,15 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        return round(self.sh.shape[1] ** 0.5) - 1
+        return round(math.sqrt(self.sh.shape[1])) - 1
 
 
 ATTRIBUTES = tuple(field.name for field in fields(Gaussians))
+
+
+def arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
+    """In the order of `ATTRIBUTES`; no copies."""
+    return tuple(getattr(gaussians, name) for name in ATTRIBUTES)
 
 
 def opacity(gaussians: Gaussians) -> np.ndarray:
@@ -46,18 +53,18 @@ def opacity(gaussians: Gaussians) -> np.ndarray:
 
 def logit(value: np.ndarray) -> np.ndarray:
     clipped = np.clip(value, 1e-6, 1 - 1e-6)
-    return np.log(clipped / (1 - clipped)).astype(np.float32)
+    return np.asarray(np.log(clipped / (1 - clipped)), dtype=np.float32)
 
 
 def drawn(gaussians: Gaussians) -> Gaussians:
     """Only those that a renderer would draw."""
     rows = gaussians.opacity_logits >= DRAWN_LOGIT
-    return Gaussians(*(getattr(gaussians, field.name)[rows] for field in fields(Gaussians)))
+    return Gaussians(*(array[rows] for array in arrays(gaussians)))
 
 
 def rows_of(gaussians: Gaussians, rows: np.ndarray | slice) -> Gaussians:
     """Some rows, by index or mask, as copies."""
-    return Gaussians(*(getattr(gaussians, name)[rows].copy() for name in ATTRIBUTES))
+    return Gaussians(*(array[rows].copy() for array in arrays(gaussians)))
 
 
 def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
@@ -71,7 +78,7 @@ def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def canonical(gaussians: Gaussians) -> Gaussians:
+def with_canonical_axes(gaussians: Gaussians) -> Gaussians:
     """The same ellipsoids with axes sorted by falling size, turned so that w is the quaternion's largest component.
 
     Of the 24 frames of an ellipsoid this one has w >= 0.5, so that x, y, z alone tell the rotation, and neighbouring

@@ -30,7 +30,7 @@ def with_rows(segment: Segment, rows: np.ndarray) -> Segment:
     )
 
 
-def segment_of(first: int, frames: Sequence[Codes], rows: Sequence[np.ndarray]) -> Segment:
+def joined_segment(first: int, frames: Sequence[Codes], rows: Sequence[np.ndarray]) -> Segment:
     """Frames as a segment, given the row of each of their Gaussians, int64 [n] a frame, none twice in a frame.
 
     A row that is absent has opacity code 0, and otherwise what it had when it was last there, or will first have.

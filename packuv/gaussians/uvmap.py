@@ -10,37 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from packuv.gaussians.uvsize import UvOptions
 from packuv.kernels.compile import kernel
 
 TRIM = 0.1
 """Share of points at either end of an axis that the trimmed mean leaves out: stray background points."""
-
-
-@dataclass(frozen=True)
-class UvOptions:
-    """Size of the UV map."""
-
-    rows: int = 1024
-    """Azimuth texels of layer 0, the paper's M0."""
-    columns: int = 1024
-    """Polar texels of layer 0, the paper's N0."""
-    layers: int = 8
-    """The paper's K; layers beyond 8 keep less than 0.5 % more on real scenes."""
-
-    def __post_init__(self) -> None:
-        if min(self.rows, self.columns, self.layers) < 1:
-            raise ValueError(f"a UV map needs at least one row, column and layer, but has {self}")
-        row_step, column_step = 2 ** ((self.layers - 1) // 2), 2 ** (self.layers // 2)
-        if self.rows % row_step or self.columns % column_step:
-            raise ValueError(
-                f"{self.layers} layers halve the map until rows are divided by {row_step} and columns by "
-                f"{column_step}, which {self.rows} x {self.columns} does not allow; choose multiples"
-            )
-
-    @property
-    def sizes(self) -> tuple[tuple[int, int], ...]:
-        """(rows, columns) of each layer: the recurrence of section 4.1."""
-        return tuple((self.rows >> k // 2, self.columns >> (k + 1) // 2) for k in range(self.layers))
 
 
 @dataclass(frozen=True)
@@ -142,7 +116,7 @@ def choose_centre(
     if cameras is not None and len(cameras):
         candidates.append(cameras.mean(axis=0, dtype=np.float64))
     kept = [alpha[assign_slots(points, alpha, centre, options=options).kept].sum() for centre in candidates]
-    return candidates[int(np.argmax(kept))]
+    return np.asarray(candidates[int(np.argmax(kept))])
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, SCALE, Codes, Quantizer, attribute_values
-from packuv.gaussians.floats import Gaussians, canonical, drawn, rows_of
+from packuv.gaussians.floats import Gaussians, drawn, rows_of, with_canonical_axes
 from packuv.gaussians.rows import first_appearance, with_rows
 from packuv.gaussians.segment import Segment
-from packuv.gaussians.uvmap import UvOptions, assign_slots, choose_centre
+from packuv.gaussians.uvmap import assign_slots, choose_centre
+from packuv.gaussians.uvsize import UvOptions
 from packuv.interchange import is_splats, read_gaussians
 from packuv.interchange.joined import equal_codes, segments_of
 from packuv.interchange.orbit import OrbitOptions, likeness, near_of, orbit
@@ -174,7 +175,7 @@ def read_frame(path: Path, *, sh_degree: int | None) -> tuple[Gaussians, int]:
     values = (whole.means, whole.log_scales, whole.quaternions, whole.opacity_logits[:, None], whole.sh)
     sound = np.logical_and.reduce([np.isfinite(v).all(axis=tuple(range(1, v.ndim))) for v in values])
     kept = drawn(rows_of(whole, sound & whole.quaternions.any(axis=1)))
-    return canonical(kept), len(whole) - len(kept)
+    return with_canonical_axes(kept), len(whole) - len(kept)
 
 
 class _Survey:

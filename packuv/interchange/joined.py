@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from packuv.gaussians.codes import Codes
-from packuv.gaussians.rows import segment_of
+from packuv.gaussians.rows import joined_segment
 from packuv.gaussians.segment import Segment
 
 GROWTH = 1.5
@@ -69,7 +69,7 @@ class _Rows:
         return rows
 
     def segment(self, first: int) -> Segment:
-        return segment_of(first, self._frames, self._rows)
+        return joined_segment(first, self._frames, self._rows)
 
 
 def equal_codes(codes: Codes, others: Codes) -> np.ndarray:

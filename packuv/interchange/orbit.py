@@ -10,7 +10,7 @@ import numpy as np
 from packuv.camera import PinholeCamera
 from packuv.gaussians.floats import Gaussians
 from packuv.metrics import psnr
-from packuv.raster import RasterOptions, Workspace, render
+from packuv.raster import Arena, RasterOptions, render
 
 NEAR_SHARE = 0.02
 """Near plane as a share of the orbit's radius."""
@@ -76,9 +76,9 @@ def near_of(cameras: tuple[PinholeCamera, ...]) -> float:
 
 def likeness(truth: Gaussians, other: Gaussians, cameras: tuple[PinholeCamera, ...], *, near: float) -> list[float]:
     """PSNR of renders of `other` against renders of `truth`, dB, one for each camera; black background."""
-    options, workspace = RasterOptions(near=near), Workspace()
+    options, arena = RasterOptions(near=near), Arena()
     found = []
     for camera in cameras:
-        pictures = [render(g, camera, options=options, workspace=workspace).colour for g in (truth, other)]
+        pictures = [render(g, camera, options=options, arena=arena).colour for g in (truth, other)]
         found.append(psnr(pictures[1], pictures[0]))
     return found

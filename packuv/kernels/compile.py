@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import ctypes
 import hashlib
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,11 +46,20 @@ def _cache_folder(module: str) -> Iterator[None]:
     # Numba reads this setting when it decorates a function; other packages keep theirs.
     config: Any = numba.config
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(Path(before or PACKAGE / "__pycache__") / f"kernels-{sources_digest(module)}")
+    config.CACHE_DIR = str(Path(before or _cache_root()) / f"kernels-{sources_digest(module)}")
     try:
         yield
     finally:
         config.CACHE_DIR = before
+
+
+@cache
+def _cache_root() -> Path:
+    """Beside the sources; in the user's cache where those are read-only, as numba's own place there has no digest."""
+    beside = PACKAGE / "__pycache__"
+    if os.access(beside if beside.exists() else PACKAGE, os.W_OK):
+        return beside
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / PACKAGE.name
 
 
 @cache
@@ -80,8 +90,11 @@ def _imported(path: Path) -> frozenset[Path]:
     """Files of this package that a file imports."""
     names: list[str] = []
     for node in ast.walk(ast.parse(path.read_bytes())):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        if isinstance(node, ast.ImportFrom):
+            if node.level or node.module is None:
+                raise ValueError(f"{path}, line {node.lineno}: relative imports hide what a kernel is made of")
+            inside = [f"{node.module}.{alias.name}" for alias in node.names]
+            names += [name if _source(name) else node.module for name in inside]
         elif isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
     return frozenset(found for name in names if (found := _source(name)))

@@ -132,7 +132,7 @@ def _part(builder: ir.IRBuilder, vector: ir.Value, part: int, width: int) -> ir.
 # -- arithmetic and comparison ----------------------------------------------------------------------------------------
 
 
-def _binary(instruction: str) -> Callable:
+def _binary(instruction: str) -> Any:
     @intrinsic
     def operation(typing, a, b):
         return a(a, b), lambda context, builder, signature, args: getattr(builder, instruction)(*args)
@@ -140,7 +140,7 @@ def _binary(instruction: str) -> Callable:
     return operation
 
 
-def _overload_operator(symbol: Callable, operation: Callable) -> None:
+def _overload_operator(symbol: Callable[..., Any], operation: Any) -> None:
     @overload(symbol)
     def implementation(a, b):
         if isinstance(a, FloatVector) and a == b:
@@ -170,7 +170,7 @@ def square_root(typing, a):
     return a(a), generate
 
 
-def _comparison(predicate: str) -> Callable:
+def _comparison(predicate: str) -> Any:
     @intrinsic
     def operation(typing, a, b):
         def generate(context, builder, signature, args):
@@ -185,7 +185,7 @@ at_least, at_most, above = _comparison(">="), _comparison("<="), _comparison(">"
 """Lane by lane; false where a value is not a number."""
 
 
-def _extremum(predicate: str) -> Callable:
+def _extremum(predicate: str) -> Any:
     # (a < b) ? a : b is exactly the machine's min: it gives b where a is not a number.
     @intrinsic
     def operation(typing, a, b):
@@ -200,7 +200,7 @@ def _extremum(predicate: str) -> Callable:
 smaller, larger = _extremum("<"), _extremum(">")
 
 
-def _extremum_of_four(predicate: str) -> Callable:
+def _extremum_of_four(predicate: str) -> Any:
     @intrinsic
     def operation(typing, a):
         def generate(context, builder, signature, args):
@@ -390,7 +390,7 @@ def store_sums(typing, array, index, vectors):
     def generate(context, builder, signature, args):
         given = [builder.extract_value(args[2], i) for i in range(len(vectors))]
         for group in range(WIDTH // count):
-            members: list = given[group * count : (group + 1) * count]
+            members: list[ir.Value | None] = given[group * count : (group + 1) * count]
             value = _transposed_sum(builder, members + [None] * (count - len(members)))
             at = builder.add(args[1], ir.Constant(_I64, group * count))
             to = _pointer(context, builder, array, args[0], at, _floats(count))
@@ -411,7 +411,7 @@ def sum_lanes(typing, vector):
     return types.float32(vector), generate
 
 
-def _transposed_sum(builder: ir.IRBuilder, vectors: list) -> ir.Value | None:
+def _transposed_sum(builder: ir.IRBuilder, vectors: list[Any]) -> ir.Value | None:
     """Lane k holds the sum over the lanes of vector k; None stands for zeros."""
     count, step = len(vectors), 1
     while len(vectors) > 1:
@@ -469,7 +469,7 @@ def align_stack(typing):
     return types.void(), generate
 
 
-def _prefetch(write: int) -> Callable:
+def _prefetch(write: int) -> Any:
     @intrinsic
     def operation(typing, array, index):
         def generate(context, builder, signature, args):

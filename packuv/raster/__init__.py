@@ -14,11 +14,11 @@ import numpy as np
 from packuv.camera import PinholeCamera
 from packuv.gaussians.floats import Gaussians
 from packuv.raster import cpu
+from packuv.raster.arena import Arena
 from packuv.raster.cpu import Rendering
 from packuv.raster.picture import Gradients, RasterOptions, tile_shape
-from packuv.raster.workspace import Workspace
 
-__all__ = ["Gradients", "RasterOptions", "Rendering", "Workspace", "gradients", "render", "tile_shape"]
+__all__ = ["Arena", "Gradients", "RasterOptions", "Rendering", "gradients", "render", "tile_shape"]
 
 
 def render(
@@ -30,19 +30,28 @@ def render(
     background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     tiles: np.ndarray | None = None,
     weights: bool = False,
-    workspace: Workspace | None = None,
+    arena: Arena | None = None,
 ) -> Any:
     """Picture of N Gaussians: `cpu.Rendering`, or `gsplat.GpuRendering` with the same fields.
 
     `tiles`, bool as `tile_shape(camera)`, names the tiles to draw; the rest shows background. `weights` asks for
-    the blending weight of each Gaussian. `workspace` holds memory between calls, CPU only. Raises ValueError if
+    the blending weight of each Gaussian. `arena` holds memory between calls, CPU only. Raises ValueError if
     shapes do not fit.
     """
     if options.device == "cpu":
-        return cpu.forward(gaussians, camera, options=options, sh_degree=sh_degree, background=background, tiles=tiles,
-                           weights=weights, workspace=workspace)  # fmt: skip
-    return _gsplat().forward(gaussians, camera, options=options, sh_degree=sh_degree, background=background,
-                             tiles=tiles, weights=weights)  # fmt: skip
+        return cpu.forward(
+            gaussians,
+            camera,
+            options=options,
+            sh_degree=sh_degree,
+            background=background,
+            tiles=tiles,
+            weights=weights,
+            arena=arena,
+        )
+    return _gsplat().forward(
+        gaussians, camera, options=options, sh_degree=sh_degree, background=background, tiles=tiles, weights=weights
+    )
 
 
 def gradients(
@@ -60,7 +69,8 @@ def gradients(
     """
     if isinstance(rendering, Rendering):
         return cpu.backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
-    return _gsplat().backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
+    found: Gradients = _gsplat().backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
+    return found
 
 
 def _gsplat() -> Any:

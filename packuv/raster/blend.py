@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numba import prange
 
+from packuv.gaussians.floats import ALPHA_MIN
 from packuv.kernels.compile import kernel
 from packuv.kernels.simd import (
     ALL,
@@ -43,7 +44,7 @@ from packuv.kernels.simd import (
 )
 from packuv.raster.bins import GAUSSIAN, MASK, SLOT
 from packuv.raster.project import BLUE, DEPTH, EXPONENT_UNIT, GREEN, LOG_OPACITY, RECORD, RED, XX, XY, YY, X, Y
-from packuv.raster.view import ALPHA_MIN, TILE
+from packuv.raster.view import TILE
 
 _f32 = np.float32
 _TRANSMITTANCE_MIN = _f32(1e-4)
@@ -330,14 +331,16 @@ def _start_tile(state, tile_x, tile_y, width, height, colour, depth, alpha, d_co
     for at in range(0, BLOCKS * WIDTH, WIDTH):
         x, y = x0 + int(state[_PIXEL_X + at]), y0 + int(state[_PIXEL_Y + at])
         if inside:
-            _start_vector(state, at, y * width + x, width, width * height, colour, depth, alpha,
-                          d_colour, d_depth, d_alpha)  # fmt: skip
+            _start_vector(
+                state, at, y * width + x, width, width * height, colour, depth, alpha, d_colour, d_depth, d_alpha
+            )
             continue
         for lane in range(WIDTH):
             px, py, to = x + (lane & 3), y + (lane >> 2), at + lane
             if px < width and py < height:
-                _start_pixel(state, to, py * width + px, width * height, colour, depth, alpha,
-                             d_colour, d_depth, d_alpha)  # fmt: skip
+                _start_pixel(
+                    state, to, py * width + px, width * height, colour, depth, alpha, d_colour, d_depth, d_alpha
+                )
             else:
                 for plane in range(0, _D_DEPTH + 1, _PLANE):
                     state[plane + to] = _f32(0)

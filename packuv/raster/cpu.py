@@ -13,15 +13,15 @@ import numba
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.floats import Gaussians, arrays
 from packuv.kernels.compile import prefer_tbb
 from packuv.kernels.simd import WIDTH, Lanes, register_lanes
 from packuv.raster import bins, blend
+from packuv.raster.arena import Arena
 from packuv.raster.picture import Gradients, RasterOptions, checked_tiles, tile_shape
 from packuv.raster.project import CHUNKS, RECORD, project, project_backward
 from packuv.raster.sh import MAX_DEGREE
 from packuv.raster.view import TILE, view_constants
-from packuv.raster.workspace import Workspace
 
 BIN_CHUNKS = 16
 """Pieces of the depth order that are put into tiles side by side."""
@@ -35,7 +35,7 @@ class _Kept:
     view: np.ndarray
     sh_degree: int
     sums: Lanes
-    workspace: Workspace
+    arena: Arena
     record: np.ndarray  # float32 [N, 16]
     first_pair: np.ndarray  # int64 [N + 1]
     pairs: np.ndarray  # uint32 [P, 3]
@@ -85,7 +85,7 @@ def forward(
     background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     tiles: np.ndarray | None = None,
     weights: bool = False,
-    workspace: Workspace | None = None,
+    arena: Arena | None = None,
     sums: Lanes | None = None,
 ) -> Rendering:
     """Render N Gaussians.
@@ -98,13 +98,13 @@ def forward(
     prefer_tbb()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     _check(gaussians, degree)
-    sums, workspace = sums or register_lanes(), workspace or Workspace()
+    sums, arena = sums or register_lanes(), arena or Arena()
     active = checked_tiles(tiles, camera)
     view = view_constants(camera, options.near, options.low_pass_px2)
-    record, box, cells, invalid = _project(gaussians, degree, view, active, workspace)
-    visible, first_pair, pairs, start = _bin(record, box, cells, active, camera.height, workspace)
-    kept = _Kept(gaussians, view, degree, sums, workspace, record, first_pair, pairs, start,
-                 workspace.take(len(start) - 1, np.int64), workspace.take(len(start) - 1, np.int32))  # fmt: skip
+    record, box, cells, invalid = _project(gaussians, degree, view, active, arena)
+    visible, first_pair, pairs, start = _bin(record, box, cells, active, camera.height, arena)
+    used_end, visited = arena.take(len(start) - 1, np.int64), arena.take(len(start) - 1, np.int32)
+    kept = _Kept(gaussians, view, degree, sums, arena, record, first_pair, pairs, start, used_end, visited)
     colour, depth, alpha, shares = _blend(kept, camera, np.asarray(background, np.float32), weights)
     return Rendering(colour, depth, alpha, visible, shares, invalid, kept)
 
@@ -123,22 +123,23 @@ def backward(
     change: for the others nothing is computed but the light that they take away.
     """
     kept = rendering._kept
-    gaussians, workspace, count = kept.gaussians, kept.workspace, len(kept.gaussians)
+    gaussians, arena, count = kept.gaussians, kept.arena, len(kept.gaussians)
     chosen = np.ones(count, np.uint8) if rows is None else _checked_rows(rows, count)
     pictures = [rendering.colour, rendering.depth, rendering.alpha]
     upstream = [_flat(d, p) for d, p in zip((d_colour, d_depth, d_alpha), pictures, strict=True)]
     height, width = rendering.alpha.shape
     pair_count = len(kept.pairs)
-    partial, used = workspace.take(pair_count * RECORD, np.float32), workspace.take(pair_count, np.uint8)
-    blend.blend_backward(kept.sums, kept.record.reshape(-1), kept.pairs, kept.start, kept.used_end, -(-width // TILE),
-                         width, height, *(p.reshape(-1) for p in pictures), *upstream, chosen, partial, used,
-                         _jobs())  # fmt: skip
+    partial, used = arena.take(pair_count * RECORD, np.float32), arena.take(pair_count, np.uint8)
+    lists = kept.record.reshape(-1), kept.pairs, kept.start, kept.used_end
+    flat = [picture.reshape(-1) for picture in pictures]
+    blend.blend_backward(
+        kept.sums, *lists, -(-width // TILE), width, height, *flat, *upstream, chosen, partial, used, _jobs()
+    )
     shapes = [(count, 3), (count, 3), (count, 4), (count,), gaussians.sh.shape, (count, 2)]
-    out = [workspace.take(shape, np.float32) for shape in shapes]
+    out = [arena.take(shape, np.float32) for shape in shapes]
     overflown = np.empty(CHUNKS, np.int64)
-    project_backward(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits,
-                     gaussians.sh, kept.sh_degree, kept.view, kept.record, chosen, kept.first_pair, used,
-                     partial, *out, overflown)  # fmt: skip
+    what, where = (kept.sh_degree, kept.view, kept.record, chosen), (kept.first_pair, used, partial)
+    project_backward(*arrays(gaussians), *what, *where, *out, overflown)
     return Gradients(out[0], out[1], out[2], out[3], out[4], out[5], int(overflown.sum()))
 
 
@@ -149,15 +150,22 @@ def _jobs() -> int:
 
 def _check(gaussians: Gaussians, degree: int) -> None:
     count = len(gaussians)
-    shapes = {"means": (count, 3), "log_scales": (count, 3), "quaternions": (count, 4), "opacity_logits": (count,),
-              "sh": (count, (gaussians.sh_degree + 1) ** 2, 3)}  # fmt: skip
+    shapes = {
+        "means": (count, 3),
+        "log_scales": (count, 3),
+        "quaternions": (count, 4),
+        "opacity_logits": (count,),
+        "sh": (count, (gaussians.sh_degree + 1) ** 2, 3),
+    }
     for name, shape in shapes.items():
         array = getattr(gaussians, name)
         if array.shape != shape or array.dtype != np.float32 or not array.flags.c_contiguous:
             raise ValueError(f"{name} must be C-contiguous float32 {shape}, but is {array.dtype} {array.shape}")
     if not 0 <= degree <= min(gaussians.sh_degree, MAX_DEGREE):
-        raise ValueError(f"cannot render SH degree {degree}: these Gaussians carry degree {gaussians.sh_degree}, "
-                         f"and {MAX_DEGREE} is the highest there is")  # fmt: skip
+        raise ValueError(
+            f"cannot render SH degree {degree}: these Gaussians carry degree {gaussians.sh_degree}, "
+            f"and {MAX_DEGREE} is the highest there is"
+        )
 
 
 def _checked_rows(rows: np.ndarray, count: int) -> np.ndarray:
@@ -174,27 +182,29 @@ def _flat(gradient: np.ndarray | None, picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(gradient, np.float32).reshape(-1)
 
 
-def _project(gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, workspace: Workspace
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:  # fmt: skip
+def _project(
+    gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, arena: Arena
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Records, boxes, tiles per box, and how many Gaussians are invalid."""
     count = len(gaussians)
     active_sum = np.zeros((active.shape[0] + 1, active.shape[1] + 1), np.int32)
     active_sum[1:, 1:] = active.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
-    record, box = workspace.take((count, RECORD), np.float32), workspace.take((count, 4), np.int32)
-    cells, invalid = workspace.take(count, np.int32), np.empty(CHUNKS, np.int64)
-    project(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits, gaussians.sh,
-            degree, view, active_sum, record, box, cells, invalid)  # fmt: skip
+    record, box = arena.take((count, RECORD), np.float32), arena.take((count, 4), np.int32)
+    cells, invalid = arena.take(count, np.int32), np.empty(CHUNKS, np.int64)
+    project(*arrays(gaussians), degree, view, active_sum, record, box, cells, invalid)
     return record, box, cells, int(invalid.sum())
 
 
-def _bin(record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndarray, height: int,
-         workspace: Workspace) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def _bin(
+    record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndarray, height: int, arena: Arena
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Tiles per Gaussian, first pair per Gaussian, pairs in tile and depth order, bounds of the tiles' lists."""
-    count, take = len(cells), workspace.take
+    count, take = len(cells), arena.take
     order, keys = [take(count, np.int32) for _ in range(2)], [take(count, np.float32) for _ in range(2)]
     drawn = bins.drawn(cells, record.reshape(-1), order[0], keys[0])
-    bins.sort_by_depth(drawn, order[0], keys[0].view(np.uint32), order[1], keys[1].view(np.uint32),
-                       np.empty((3, 2048), np.int64))  # fmt: skip
+    bins.sort_by_depth(
+        drawn, order[0], keys[0].view(np.uint32), order[1], keys[1].view(np.uint32), np.empty((3, 2048), np.int64)
+    )
     first_cell, first_pair = take(count + 1, np.int64), take(count + 1, np.int64)
     cell_count = bins.running_sum(cells, first_cell)
     tiles, masks, visible = take(cell_count, np.int32), take(cell_count, np.uint32), take(count, np.int32)
@@ -207,19 +217,21 @@ def _bin(record: np.ndarray, box: np.ndarray, cells: np.ndarray, active: np.ndar
     return visible, first_pair, pairs, start
 
 
-def _blend(kept: _Kept, camera: PinholeCamera, background: np.ndarray, weights: bool
-           ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:  # fmt: skip
+def _blend(
+    kept: _Kept, camera: PinholeCamera, background: np.ndarray, weights: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
     """Colour, depth, alpha, and the blending weights if they are wanted."""
-    take, width, height = kept.workspace.take, camera.width, camera.height
+    take, width, height = kept.arena.take, camera.width, camera.height
     colour, depth, alpha = (
         take((3, height, width), np.float32),
         take((height, width), np.float32),
         take((height, width), np.float32),
     )
     partial = take(len(kept.pairs) if weights else 0, np.float32)
-    blend.blend(kept.sums, kept.record.reshape(-1), kept.pairs, kept.start, tile_shape(camera)[1], width, height,
-                background, colour.reshape(-1), depth.reshape(-1), alpha.reshape(-1), kept.used_end, kept.visited,
-                partial, _jobs())  # fmt: skip
+    lists = kept.record.reshape(-1), kept.pairs, kept.start
+    flat = [picture.reshape(-1) for picture in (colour, depth, alpha)]
+    out = kept.used_end, kept.visited, partial
+    blend.blend(kept.sums, *lists, tile_shape(camera)[1], width, height, background, *flat, *out, _jobs())
     if not weights:
         return colour, depth, alpha, None
     shares = take(len(kept.gaussians), np.float32)

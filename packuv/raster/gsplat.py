@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from packuv.camera import PinholeCamera
-from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.floats import Gaussians, arrays
 from packuv.raster.picture import Gradients, RasterOptions, checked_tiles
 from packuv.raster.view import MAX_COLOUR, MAX_LENGTH, MAX_LOG_SCALE, TILE
 
@@ -59,7 +59,7 @@ def forward(
     Raises ImportError, saying what to install, where gsplat is missing.
     """
     device = torch.device(options.device)
-    leaves = tuple(torch.tensor(array, device=device, requires_grad=True) for array in _fields(gaussians))
+    leaves = tuple(torch.tensor(array, device=device, requires_grad=True) for array in arrays(gaussians))
     scene, valid = _sanitized(*leaves)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     mask = _pixel_mask(tiles, camera, device)
@@ -99,12 +99,9 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().numpy()
 
 
-def _fields(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
-    return (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits, gaussians.sh)
-
-
-def _sanitized(means: Tensor, log_scales: Tensor, quaternions: Tensor, logits: Tensor, sh: Tensor
-               ) -> tuple[dict[str, Tensor], Tensor]:  # fmt: skip
+def _sanitized(
+    means: Tensor, log_scales: Tensor, quaternions: Tensor, logits: Tensor, sh: Tensor
+) -> tuple[dict[str, Tensor], Tensor]:
     """gsplat's inputs, with invalid rows replaced by harmless ones of opacity 0, and which rows are valid, bool [N]."""
     with torch.no_grad():
         valid = (means.abs().amax(1) <= MAX_LENGTH) & (log_scales.amax(1) <= MAX_LOG_SCALE)
@@ -121,8 +118,14 @@ def _sanitized(means: Tensor, log_scales: Tensor, quaternions: Tensor, logits: T
     return scene, valid
 
 
-def _rasterize(scene: dict[str, Tensor], colours: Tensor, camera: PinholeCamera, options: RasterOptions,
-               sh_degree: int | None, mode: str) -> tuple[Tensor, Tensor, dict[str, Any]]:  # fmt: skip
+def _rasterize(
+    scene: dict[str, Tensor],
+    colours: Tensor,
+    camera: PinholeCamera,
+    options: RasterOptions,
+    sh_degree: int | None,
+    mode: str,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """One camera: values [H, W, D], alpha [H, W], gsplat's intermediate results."""
     like: dict[str, Any] = {"dtype": torch.float32, "device": colours.device}
     geometry = {name: scene[name] for name in ("means", "quats", "scales", "opacities")}

@@ -60,6 +60,8 @@ def checked_tiles(tiles: np.ndarray | None, camera: PinholeCamera) -> np.ndarray
     if tiles is None:
         return np.ones(shape, np.uint8)
     if tiles.shape != shape or tiles.dtype != bool:
-        raise ValueError(f"tiles must be bool {shape} for a picture of {camera.width}x{camera.height} pixels, "
-                         f"but is {tiles.dtype} {tiles.shape}")  # fmt: skip
+        raise ValueError(
+            f"tiles must be bool {shape} for a picture of {camera.width}x{camera.height} pixels, "
+            f"but is {tiles.dtype} {tiles.shape}"
+        )
     return np.ascontiguousarray(tiles).view(np.uint8)

@@ -12,23 +12,24 @@ import math
 import numpy as np
 from numba import prange
 
+from packuv.gaussians.floats import ALPHA_MIN, DRAWN_LOGIT
 from packuv.kernels.compile import kernel
 from packuv.kernels.simd import ALL, load, store, zeros
+from packuv.raster import ewa
 from packuv.raster import sh as harmonics
 from packuv.raster.view import (
-    _CENTRE,
-    _LOW_PASS,
-    _SLOPE_LIMITS,
-    ALPHA_MIN,
     MAX_COLOUR,
     MAX_LENGTH,
     MAX_LOG_SCALE,
+    VIEW_CENTRE,
     VIEW_CX,
     VIEW_CY,
     VIEW_FX,
     VIEW_FY,
     VIEW_HEIGHT,
+    VIEW_LOW_PASS,
     VIEW_NEAR,
+    VIEW_SLOPES,
     VIEW_WIDTH,
 )
 
@@ -46,70 +47,15 @@ RECORD = 16
 EXPONENT_UNIT = 8.0
 _LOG2E = 1.4426950408889634
 _LOG_ALPHA_MIN = math.log(ALPHA_MIN)
-_LOGIT_MIN = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
 _REACH_MAX = -2 * _LOG_ALPHA_MIN
 _f32 = np.float32
 _FAST = frozenset({"contract", "nsz"})
 
 
-@kernel(inline=True, fastmath=_FAST)
-def _in_camera(view, x, y, z):
-    """A world point on the camera's axes."""
-    return (
-        view[0] * x + view[1] * y + view[2] * z + view[9],
-        view[3] * x + view[4] * y + view[5] * z + view[10],
-        view[6] * x + view[7] * y + view[8] * z + view[11],
-    )
-
-
-@kernel(inline=True, fastmath=_FAST)
-def _linear_map(view, u, v, inverse_z):
-    """Jacobian of the projection at slopes u = x / z and v = y / z (its four entries that are not zero), and the same
-    after the camera's rotation, [2, 3] by rows."""
-    u = min(max(u, view[_SLOPE_LIMITS]), view[_SLOPE_LIMITS + 1])
-    v = min(max(v, view[_SLOPE_LIMITS + 2]), view[_SLOPE_LIMITS + 3])
-    a, b = view[VIEW_FX] * inverse_z, view[VIEW_FY] * inverse_z
-    c, d = -a * u, -b * v
-    return (a, c, b, d), (
-        a * view[0] + c * view[6], a * view[1] + c * view[7], a * view[2] + c * view[8],
-        b * view[3] + d * view[6], b * view[4] + d * view[7], b * view[5] + d * view[8],
-    )  # fmt: skip
-
-
-@kernel(inline=True, fastmath=_FAST)
-def _rotation(w, x, y, z):
-    """Rotation matrix of a unit quaternion, by rows."""
-    return (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-
-
-@kernel(inline=True, fastmath=_FAST)
-def _screen_axes(u, r, s0, s1, s2):
-    """The three axes of a Gaussian in the picture, pixels: M = U R S, [2, 3] by rows."""
-    return (
-        s0 * (u[0] * r[0] + u[1] * r[3] + u[2] * r[6]),
-        s1 * (u[0] * r[1] + u[1] * r[4] + u[2] * r[7]),
-        s2 * (u[0] * r[2] + u[1] * r[5] + u[2] * r[8]),
-        s0 * (u[3] * r[0] + u[4] * r[3] + u[5] * r[6]),
-        s1 * (u[3] * r[1] + u[4] * r[4] + u[5] * r[7]),
-        s2 * (u[3] * r[2] + u[4] * r[5] + u[5] * r[8]),
-    )
-
-
-@kernel(inline=True, fastmath=_FAST)
-def _covariance(m, low_pass):
-    """xx, xy, yy of M M^T plus the low-pass filter, pixels^2, and the determinant.
-
-    The determinant is |row0 x row1|^2 + low_pass * trace - low_pass^2 (Lagrange): a thin ellipse cancels nothing.
-    """
-    xx = m[0] * m[0] + m[1] * m[1] + m[2] * m[2] + low_pass
-    xy = m[0] * m[3] + m[1] * m[4] + m[2] * m[5]
-    yy = m[3] * m[3] + m[4] * m[4] + m[5] * m[5] + low_pass
-    n0, n1, n2 = m[1] * m[5] - m[2] * m[4], m[2] * m[3] - m[0] * m[5], m[0] * m[4] - m[1] * m[3]
-    return xx, xy, yy, n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (xx + yy) - low_pass * low_pass
+_in_camera, _linear_map, _rotation, _screen_axes, _covariance = (
+    kernel(inline=True, fastmath=_FAST)(function)
+    for function in (ewa.in_camera, ewa.linear_map, ewa.rotation, ewa.screen_axes, ewa.covariance)
+)
 
 
 @kernel(inline=True, fastmath=_FAST)
@@ -145,7 +91,7 @@ def _touches(view, x, y, half_x, half_y, active_sum, box, i):
 @kernel(inline=True, fastmath=_FAST)
 def _direction(view, means, i):
     """Unit vector from the camera to a Gaussian, world, and one over the distance."""
-    x, y, z = means[i, 0] - view[_CENTRE], means[i, 1] - view[_CENTRE + 1], means[i, 2] - view[_CENTRE + 2]
+    x, y, z = means[i, 0] - view[VIEW_CENTRE], means[i, 1] - view[VIEW_CENTRE + 1], means[i, 2] - view[VIEW_CENTRE + 2]
     inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
     return _f32(x * inverse), _f32(y * inverse), _f32(z * inverse), inverse
 
@@ -168,7 +114,7 @@ def _colour(view, means, sh, degree, values, record, i):
 def _project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
     """Fill the record (but for the colour) and the box of one valid Gaussian; False if it is not drawn."""
     x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
-    if not (z >= view[VIEW_NEAR] and logits[i] >= _LOGIT_MIN):
+    if not (z >= view[VIEW_NEAR] and logits[i] >= DRAWN_LOGIT):
         return False
     inverse_z = 1.0 / z
     u, v = x * inverse_z, y * inverse_z
@@ -176,12 +122,14 @@ def _project_one(means, log_scales, quaternions, logits, view, active_sum, recor
     (a, b, c, d), axes = _linear_map(view, u, v, inverse_z)
     # A circle around the largest ellipse that these scales allow spares most Gaussians that are not drawn the rest.
     size = math.exp(max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2])))
-    bound = math.sqrt(_REACH_MAX * ((a * a + b * b + c * c + d * d) * size * size + view[_LOW_PASS]))
+    bound = math.sqrt(_REACH_MAX * ((a * a + b * b + c * c + d * d) * size * size + view[VIEW_LOW_PASS]))
     if not _touches(view, px, py, bound, bound, active_sum, box, i):
         return False
     q0, q1, q2, q3, _ = _unit(quaternions, i)
     s0, s1, s2 = math.exp(log_scales[i, 0]), math.exp(log_scales[i, 1]), math.exp(log_scales[i, 2])
-    xx, xy, yy, determinant = _covariance(_screen_axes(axes, _rotation(q0, q1, q2, q3), s0, s1, s2), view[_LOW_PASS])
+    xx, xy, yy, determinant = _covariance(
+        _screen_axes(axes, _rotation(q0, q1, q2, q3), s0, s1, s2), view[VIEW_LOW_PASS]
+    )
     log_opacity = -math.log1p(math.exp(-np.float64(logits[i])))
     reach = max(2.0 * (log_opacity - _LOG_ALPHA_MIN), 0.0)
     if not _touches(view, px, py, math.sqrt(reach * xx), math.sqrt(reach * yy), active_sum, box, i):
@@ -198,8 +146,12 @@ def _project_one(means, log_scales, quaternions, logits, view, active_sum, recor
 @kernel(inline=True, fastmath=_FAST)
 def _unit(quaternions, i):
     """The unit quaternion, and one over the length of the given one."""
-    w, x, y, z = (np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]),
-                  np.float64(quaternions[i, 3]))  # fmt: skip
+    w, x, y, z = (
+        np.float64(quaternions[i, 0]),
+        np.float64(quaternions[i, 1]),
+        np.float64(quaternions[i, 2]),
+        np.float64(quaternions[i, 3]),
+    )
     inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
@@ -313,10 +265,10 @@ def _point_gradient(view, u, v, inverse_z, d_depth, screen, jacobian, d_jacobian
     pz = d_depth - px * u - py * v
     a, c, b, d = jacobian
     pz -= (d_jacobian[0] * a + d_jacobian[1] * c + d_jacobian[2] * b + d_jacobian[3] * d) * inverse_z
-    if view[_SLOPE_LIMITS] < u < view[_SLOPE_LIMITS + 1]:
+    if view[VIEW_SLOPES] < u < view[VIEW_SLOPES + 1]:
         through = -a * inverse_z * d_jacobian[1]
         px, pz = px + through, pz - through * u
-    if view[_SLOPE_LIMITS + 2] < v < view[_SLOPE_LIMITS + 3]:
+    if view[VIEW_SLOPES + 2] < v < view[VIEW_SLOPES + 3]:
         through = -b * inverse_z * d_jacobian[3]
         py, pz = py + through, pz - through * v
     return (
@@ -339,7 +291,7 @@ def _project_one_backward(
     r = _rotation(q0, q1, q2, q3)
     s0, s1, s2 = math.exp(log_scales[i, 0]), math.exp(log_scales[i, 1]), math.exp(log_scales[i, 2])
     m = _screen_axes(axes, r, s0, s1, s2)
-    xx, xy, yy, determinant = _covariance(m, view[_LOW_PASS])
+    xx, xy, yy, determinant = _covariance(m, view[VIEW_LOW_PASS])
     scale = 1.0 / determinant
     a, b, c = yy * scale, -xy * scale, xx * scale
     screen = a * g[1] + b * g[2], b * g[1] + c * g[2]
@@ -389,8 +341,9 @@ def project_backward(means, log_scales, quaternions, logits, sh, degree, view, r
             if rows[i] == 0 or not _sum_pairs(partial, used, first_pair[i], first_pair[i + 1], g):
                 _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i)
                 continue
-            x, y, z = _project_one_backward(means, log_scales, quaternions, logits, view, g, d_log_scales,
-                                            d_quaternions, d_logits, d_screen, i)  # fmt: skip
+            x, y, z = _project_one_backward(
+                means, log_scales, quaternions, logits, view, g, d_log_scales, d_quaternions, d_logits, d_screen, i
+            )
             cx, cy, cz = _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i)
             d_means[i, 0], d_means[i, 1], d_means[i, 2] = x + cx, y + cy, z + cz
             if not _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):

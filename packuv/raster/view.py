@@ -8,18 +8,16 @@ from packuv.camera import PinholeCamera
 
 TILE = 16
 """Pixels along a side of a tile."""
-ALPHA_MIN = 1.0 / 255.0
 MAX_LENGTH = 1e18
 """World units; squares of larger positions leave the range of float32."""
 MAX_LOG_SCALE = 40.0
 MAX_COLOUR = 1e12
 MARGIN = 0.15
 """The local linear map of a Gaussian outside the picture is taken at most this share of the picture beyond its edge."""
-# Entries of a view.
-_ROTATION, _TRANSLATION, _CENTRE = 0, 9, 16
+# Entries of a view; before them stand the rotation, by rows, and the translation.
 VIEW_FX, VIEW_FY, VIEW_CX, VIEW_CY = 12, 13, 14, 15
-VIEW_WIDTH, VIEW_HEIGHT = 19, 20
-_SLOPE_LIMITS, VIEW_NEAR, _LOW_PASS = 21, 25, 26
+VIEW_CENTRE, VIEW_WIDTH, VIEW_HEIGHT = 16, 19, 20
+VIEW_SLOPES, VIEW_NEAR, VIEW_LOW_PASS = 21, 25, 26
 
 
 def view_constants(camera: PinholeCamera, near: float, low_pass_px2: float) -> np.ndarray:

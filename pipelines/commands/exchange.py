@@ -11,7 +11,7 @@ from pipelines.commands.terminal import print_facts, shown, size_text
 
 if TYPE_CHECKING:
     from calibration.rig import Rig
-    from packuv.gaussians.uvmap import UvOptions
+    from packuv.gaussians.uvsize import UvOptions
     from packuv.interchange import SplatFormat
     from packuv.scene import Scene
 
@@ -228,7 +228,7 @@ def _atlas_text(facts: Mapping[str, Any]) -> str:
 
 
 def _uv(arguments: argparse.Namespace) -> UvOptions:
-    from packuv.gaussians.uvmap import UvOptions
+    from packuv.gaussians.uvsize import UvOptions
 
     return UvOptions(rows=arguments.map, columns=arguments.map, layers=arguments.layers)
 

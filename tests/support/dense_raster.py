@@ -50,8 +50,10 @@ def ellipses(means, log_scales, quaternions, camera, options):
     """Centres in the picture [N, 2], inverse covariances [N, 2, 2], depth [N]."""
     pose = torch.from_numpy(camera.camera_from_world)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
-    slopes = (clamped_slope(x / z, camera.cx, camera.fx, camera.width),
-              clamped_slope(y / z, camera.cy, camera.fy, camera.height))  # fmt: skip
+    slopes = (
+        clamped_slope(x / z, camera.cx, camera.fx, camera.width),
+        clamped_slope(y / z, camera.cy, camera.fy, camera.height),
+    )
     o = torch.zeros_like(x)
     rows = [camera.fx / z, o, -camera.fx * slopes[0] / z, o, camera.fy / z, -camera.fy * slopes[1] / z]
     jacobian = torch.stack(rows, -1).view(-1, 2, 3)
@@ -70,8 +72,9 @@ def reference(fields, camera, degree, options=OPTIONS, background=BACKGROUND, sh
     centre, conic, z = ellipses(means, log_scales, quaternions, camera, options)
     eye = torch.from_numpy(camera.centre)
     colour = sh_colour(degree, sh, torch.nn.functional.normalize(means - eye, dim=-1))
-    picture, alpha, sums = blend(centre + shift, conic, z, torch.sigmoid(logits), torch.cat([colour, z[:, None]], 1),
-                                 camera, options.near)  # fmt: skip
+    picture, alpha, sums = blend(
+        centre + shift, conic, z, torch.sigmoid(logits), torch.cat([colour, z[:, None]], 1), camera, options.near
+    )
     behind = torch.tensor(background, dtype=torch.float64)
     return picture[:3] + (1 - alpha) * behind[:, None, None], picture[3], alpha, sums
 

@@ -6,20 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import prange
+from scipy.spatial import KDTree
 
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
 from packuv.fit.start.points import Points, no_points, seen_colours
 from packuv.gaussians.codes import OPACITY_RANGE
 from packuv.gaussians.floats import Gaussians
-from packuv.kernels.compile import kernel
 
 SH_BASE = 0.28209479177387814
 """Value of the constant spherical harmonic"""
 
 _ROUNDS = 8
 """Draws of random places before fewer than asked for will do"""
+
+_CANDIDATES = 16
+"""Neighbours among which float32 distances choose: more than the twelve that can be equally near on a lattice"""
 
 
 @dataclass(frozen=True)
@@ -113,27 +115,19 @@ def _random_points(
 def random_ball(rng: np.random.Generator, count: int) -> np.ndarray:
     """Points evenly spread in the unit ball, float64 [count, 3]."""
     direction = rng.standard_normal((count, 3))
-    return direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(rng.random((count, 1)))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return direction * np.cbrt(rng.random((count, 1)))
 
 
-@kernel(parallel=True)
-def neighbour_distance(points):
-    """Mean distance to the three nearest other points, float32 [N]; every pair is looked at, O(N^2)."""
-    count = len(points)
-    out = np.empty(count, np.float32)
-    for row in prange(count):
-        i = np.int64(row)
-        a = b = c = np.float32(np.inf)
-        for j in range(count):
-            x, y, z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
-            d = x * x + y * y + z * z
-            if j == i or d >= c:
-                continue
-            if d < a:
-                a, b, c = d, a, b
-            elif d < b:
-                b, c = d, b
-            else:
-                c = d
-        out[i] = (np.sqrt(a) + np.sqrt(b) + np.sqrt(c)) / np.float32(3) if c < np.inf else np.float32(1e-3)
-    return out
+def neighbour_distance(points: np.ndarray) -> np.ndarray:
+    """Mean distance of points, float32 [N, 3], to the three nearest others, float32 [N]; 1e-3 where there are fewer.
+
+    O(N log N).
+    """
+    if len(points) < 4:
+        return np.full(len(points), 1e-3, np.float32)
+    _, near = KDTree(points).query(points, k=min(_CANDIDATES, len(points)))
+    x, y, z = np.moveaxis(points[near] - points[:, None], 2, 0)  # [N, candidates] each
+    # The nearest is the point itself, or one in the same place.
+    a, b, c = np.sqrt(np.sort(x * x + y * y + z * z, axis=1)[:, 1:4]).T
+    return np.where(c < np.inf, (a + b + c) / np.float32(3), np.float32(1e-3))

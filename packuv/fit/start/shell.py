@@ -21,6 +21,7 @@ from packuv.fit.depth import SparseDepth
 from packuv.fit.start.bounds import Bounds
 from packuv.fit.start.points import Points, drawn, pixels_of
 from packuv.kernels.compile import kernel, prefer_tbb
+from packuv.raster import ewa
 from packuv.raster.view import VIEW_CX, VIEW_CY, VIEW_FX, VIEW_FY, VIEW_HEIGHT, VIEW_NEAR, VIEW_WIDTH, view_constants
 
 
@@ -146,7 +147,7 @@ def interpolate(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
         sums.append(_quartered(sums[-1]))
         weights.append(_quartered(weights[-1]))
     total = max(weights[-1].sum(), 1e-12)
-    mean = np.full_like(sums[-1], sums[-1].sum() / total)
+    mean: np.ndarray = np.full_like(sums[-1], sums[-1].sum() / total)
     for block_sum, block_weight in zip(reversed(sums), reversed(weights), strict=True):
         if mean.shape != block_sum.shape:
             mean = _doubled(mean)
@@ -233,6 +234,9 @@ def _colours(
     return (total / np.maximum(views, 1)[:, None]).reshape(xyz.shape), views.reshape(xyz.shape[:2])
 
 
+_in_camera = kernel(inline=True)(ewa.in_camera)
+
+
 @kernel(parallel=True)
 def _paint(rays, centre, distance, views, grey, grazing, painted):
     """Each camera's brightness in each direction on the sphere, NaN where the camera does not see it.
@@ -246,11 +250,9 @@ def _paint(rays, centre, distance, views, grey, grazing, painted):
             for c in range(len(views)):
                 w = views[c]
                 painted[c, v, u] = np.nan
-                z = w[6] * px + w[7] * py + w[8] * pz + w[11]
+                x, y, z = _in_camera(w, px, py, pz)
                 if z < w[VIEW_NEAR]:
                     continue
-                x = w[0] * px + w[1] * py + w[2] * pz + w[9]
-                y = w[3] * px + w[4] * py + w[5] * pz + w[10]
                 column, row = w[VIEW_FX] * x / z + w[VIEW_CX] - 0.5, w[VIEW_FY] * y / z + w[VIEW_CY] - 0.5
                 if not (column >= 0 and row >= 0 and column < w[VIEW_WIDTH] - 1 and row < w[VIEW_HEIGHT] - 1):
                     continue
@@ -296,7 +298,7 @@ def _compare(painted, half, rule, index, score, last, around, step, seers):
             last[v, u] = found
 
 
-@kernel()
+@kernel(inner=True)
 def _patches(painted, v, u, half, noise, patches, who):
     """Windows of the cameras that see all of one, without their mean and in units of their contrast."""
     columns, size, cameras = painted.shape[2], patches.shape[1], 0
@@ -324,7 +326,7 @@ def _patches(painted, v, u, half, noise, patches, who):
     return cameras
 
 
-@kernel()
+@kernel(inner=True)
 def _with_others(patch, mean, inside):
     """Sum of correlations with the patches whose sum is `mean`; without its own if it is one of them."""
     dot, own = np.float32(0), np.float32(0)
@@ -334,7 +336,7 @@ def _with_others(patch, mean, inside):
     return dot - own if inside else dot
 
 
-@kernel()
+@kernel(inner=True)
 def _agreement(patches, cameras, gain, mean):
     """Mean correlation among the best two thirds of the patches, whose sum is left in `mean`, and their number.
 

@@ -28,7 +28,8 @@ from packuv.atlas.picture import (
 from packuv.atlas.video import ATTACHMENT, EXACT_ALWAYS, AtlasCodec, AtlasVideo, AtlasVideoOptions, export_atlas
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
-from packuv.gaussians.uvmap import UvOptions, atlas_size
+from packuv.gaussians.uvmap import atlas_size
+from packuv.gaussians.uvsize import UvOptions
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.scene.header import codes_digest
 

@@ -6,7 +6,7 @@ from packuv.fit.model import Model
 from packuv.fit.start.bounds import Bounds
 from packuv.fit.start.first import round_gaussians
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity
-from packuv.gaussians.uvmap import UvOptions
+from packuv.gaussians.uvsize import UvOptions
 
 BOUNDS = Bounds(np.zeros(3), 2.0, 0.2)
 UV = UvOptions(rows=64, columns=64, layers=4)

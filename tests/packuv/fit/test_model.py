@@ -1,7 +1,7 @@
 import numpy as np
 
 from packuv.fit.model import Model, Rates
-from packuv.gaussians.floats import ATTRIBUTES, Gaussians, canonical, rotation_matrices, rows_of
+from packuv.gaussians.floats import ATTRIBUTES, Gaussians, rotation_matrices, rows_of, with_canonical_axes
 
 
 def some(count: int, seed: int = 0, sh_degree: int = 1) -> Gaussians:
@@ -27,15 +27,15 @@ def snapshot(model: Model) -> dict[str, np.ndarray]:
 
 def test_canonical_frame_is_the_same_ellipsoid_with_large_w_and_sorted_axes():
     g = some(2000)
-    c = canonical(g)
+    c = with_canonical_axes(g)
     np.testing.assert_allclose(covariance(c), covariance(g), rtol=2e-4, atol=1e-7)  # float32 quaternions
     assert (c.quaternions[:, 0] >= 0.5 - 1e-6).all()
     assert (np.diff(c.log_scales, axis=1) <= 0).all()
 
 
 def test_canonical_of_canonical_changes_nothing_but_rounding():
-    c = canonical(some(500))
-    np.testing.assert_allclose(canonical(c).quaternions, c.quaternions, atol=1e-6)
+    c = with_canonical_axes(some(500))
+    np.testing.assert_allclose(with_canonical_axes(c).quaternions, c.quaternions, atol=1e-6)
 
 
 def test_a_step_moves_the_chosen_rows_and_no_bit_of_the_others():

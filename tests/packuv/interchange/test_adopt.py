@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes
 from packuv.gaussians.floats import rows_of
 from packuv.gaussians.rows import first_appearance
-from packuv.gaussians.uvmap import UvOptions
+from packuv.gaussians.uvsize import UvOptions
 from packuv.interchange import write_ply, write_spz
 from packuv.interchange.adopt import AdoptOptions, adopt, find_frames, read_frame
 from packuv.interchange.joined import GROWTH, equal_codes, segments_of

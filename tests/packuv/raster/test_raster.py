@@ -16,7 +16,7 @@ import torch
 from packuv.camera import PinholeCamera
 from packuv.gaussians.floats import Gaussians
 from packuv.kernels.simd import ALL, HALF
-from packuv.raster import RasterOptions, Workspace, gradients, render, tile_shape
+from packuv.raster import Arena, RasterOptions, gradients, render, tile_shape
 from packuv.raster.cpu import Rendering, backward, forward
 from tests.support.dense_raster import BACKGROUND, FIELDS, OPTIONS, camera, reference, scene, upstream
 
@@ -336,34 +336,34 @@ def test_bytes_depend_neither_on_the_run_nor_on_the_threads(tmp_path):
 
 
 def test_a_rendering_stays_valid_while_others_are_made():
-    gaussians, view, workspace = scene(200), camera(), Workspace()
-    first = forward(gaussians, view, options=OPTIONS, workspace=workspace)
+    gaussians, view, arena = scene(200), camera(), Arena()
+    first = forward(gaussians, view, options=OPTIONS, arena=arena)
     colour, expected = first.colour.copy(), backward(first, *upstream(view)).means.copy()
     for seed in range(3):
-        other = forward(scene(300, seed=seed), view, options=OPTIONS, workspace=workspace)
+        other = forward(scene(300, seed=seed), view, options=OPTIONS, arena=arena)
         backward(other, *upstream(view))
     assert np.array_equal(first.colour, colour)
     assert np.array_equal(backward(first, *upstream(view)).means, expected)
 
 
 def test_a_picture_outlives_its_rendering():
-    gaussians, view, workspace = scene(200), camera(), Workspace()
-    colour = forward(gaussians, view, options=OPTIONS, workspace=workspace).colour
+    gaussians, view, arena = scene(200), camera(), Arena()
+    colour = forward(gaussians, view, options=OPTIONS, arena=arena).colour
     row, copy = colour[1, 10:20], colour.copy()
     for seed in range(3):
-        forward(scene(200, seed=seed), view, options=OPTIONS, workspace=workspace)
+        forward(scene(200, seed=seed), view, options=OPTIONS, arena=arena)
     assert np.array_equal(colour, copy)
     assert np.array_equal(row, copy[1, 10:20])
 
 
 def test_a_workspace_stops_growing():
-    view, workspace = camera(), Workspace()
+    view, arena = camera(), Arena()
     sizes = []
     for step in range(12):
-        rendering = forward(scene(200 + 40 * (step % 3)), view, options=OPTIONS, workspace=workspace, weights=True)
+        rendering = forward(scene(200 + 40 * (step % 3)), view, options=OPTIONS, arena=arena, weights=True)
         backward(rendering, *upstream(view))
         del rendering
-        sizes.append(workspace.free_bytes)
+        sizes.append(arena.free_bytes)
     assert sizes[5] == sizes[-1]
 
 

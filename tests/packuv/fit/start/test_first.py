@@ -34,6 +34,29 @@ def test_neighbour_distance_equals_brute_force():
     np.testing.assert_allclose(neighbour_distance(points), expected, rtol=1e-5)  # float32
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_with_fewer_than_three_others_the_distance_is_a_small_one(count):
+    points = np.random.default_rng(0).normal(size=(count, 3)).astype(np.float32)
+    assert neighbour_distance(points).tolist() == [np.float32(1e-3)] * count
+    assert neighbour_distance(points).dtype == np.float32
+
+
+def test_equal_points_have_no_distance():
+    cloud = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
+    assert not neighbour_distance(np.ones((50, 3), np.float32)).any()
+    assert not neighbour_distance(np.repeat(cloud, 4, axis=0)).any()
+    pairs = np.repeat(cloud, 2, axis=0)
+    np.testing.assert_array_equal(neighbour_distance(pairs)[::2], neighbour_distance(pairs)[1::2])
+    assert neighbour_distance(pairs).all()
+
+
+def test_neighbour_distance_does_not_depend_on_the_order_of_points():
+    rng = np.random.default_rng(0)
+    lattice = np.stack(np.meshgrid(*[0.1 * np.arange(8)] * 3), axis=-1).reshape(-1, 3).astype(np.float32)
+    order = rng.permutation(len(lattice))
+    np.testing.assert_array_equal(neighbour_distance(lattice[order]), neighbour_distance(lattice)[order])
+
+
 def test_the_first_gaussians_are_seen_and_take_the_colours_of_the_pictures(ring):
     cameras = ring(6)
     pictures = [np.full((3, c.height, c.width), 0.25, np.float32) for c in cameras]
@@ -74,8 +97,9 @@ def test_hull_points_lie_where_the_masks_meet(ring):
         (u, v), depth = camera.project(centre[None])[0][0], camera.project(centre[None])[1][0]
         masks.append(np.hypot(x - u, y - v) < radius * camera.fx / depth)
     pictures = [np.full((3, c.height, c.width), 0.5, np.float32) for c in cameras]
-    found = hull_points(cameras, pictures, masks, bounds=bounds, options=StartOptions(), count=400,
-                        rng=np.random.default_rng(0))  # fmt: skip
+    found = hull_points(
+        cameras, pictures, masks, bounds=bounds, options=StartOptions(), count=400, rng=np.random.default_rng(0)
+    )
     assert len(found.xyz) > 20
     # One camera in five may miss: the hull is a little wider than the ball.
     assert np.linalg.norm(found.xyz - centre, axis=1).max() < 1.8 * radius

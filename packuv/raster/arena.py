@@ -13,12 +13,11 @@ class _Lease:
 
     def __init__(self, memory: np.ndarray, dtype: np.dtype, shape: tuple[int, ...]):
         address, read_only = memory.__array_interface__["data"]
-        self.__array_interface__ = {
-            "version": 3, "typestr": dtype.str, "shape": shape, "data": (address, read_only),
-        }  # fmt: skip
+        data = address, read_only
+        self.__array_interface__ = {"version": 3, "typestr": dtype.str, "shape": shape, "data": data}
 
 
-class Workspace:
+class Arena:
     """Memory for pictures and gradients, used again as soon as no array refers to it: a fit's memory stays flat.
 
     Serves one thread at a time. An array that it handed out stays valid as long as anyone holds it or a view of it.
