@@ -12,6 +12,9 @@ import numpy as np
 
 QUALITY_CRF = 14
 """x264's constant rate factor: about 42 dB against the rendered picture"""
+REPRODUCIBLE = "threads=1:sliced-threads=0:cpu-independent=1"
+"""One thread, so that rate decisions do not depend on the machine's cores; and no choice of code by the processor: that
+of x264's macroblock tree for AVX-512 reads memory that nobody wrote, so that some of eight videos differed each time"""
 KEYFRAME_INTERVAL = 30
 BT709, LIMITED_RANGE = 1, 1
 """Code points of ITU-T H.273 and FFmpeg's colour range"""
@@ -26,9 +29,8 @@ class VideoWriter:
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.time_base = 1 / fps
         context = stream.codec_context
-        # one thread, so that rate decisions and hence bytes do not depend on the machine's cores
         context.thread_count = 1
-        context.options = {"crf": str(QUALITY_CRF), "preset": "medium", "x264-params": "threads=1:sliced-threads=0"}
+        context.options = {"crf": str(QUALITY_CRF), "preset": "medium", "x264-params": REPRODUCIBLE}
         context.gop_size = KEYFRAME_INTERVAL
         context.color_primaries = context.color_trc = context.colorspace = BT709
         context.color_range = LIMITED_RANGE

@@ -17,7 +17,7 @@ from packuv.fit.start.bounds import Bounds
 from packuv.fit.terms import Pull, Seen, pulls, summed
 from packuv.footage import Views
 from packuv.gaussians.codes import Quantizer
-from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity, rows_of
+from packuv.gaussians.floats import ALPHA_MIN, ATTRIBUTES, Gaussians, opacity, rows_of
 from packuv.progress import Ticks
 from packuv.raster import Arena, Gradients, RasterOptions, Rendering, gradients, render
 
@@ -251,7 +251,9 @@ class Solver:
 def tiled(shots: Sequence[Shot], masks: Sequence[np.ndarray | None], solver: Solver, views: Views) -> list[Shot]:
     """The same pictures, limited to the tiles that a mask or a Gaussian that may change touches."""
     by_name = {camera.name: mask for camera, mask in zip(views.cameras, masks, strict=True)}
-    moving = rows_of(solver.model.gaussians, np.flatnonzero(solver.rows & (opacity(solver.model.gaussians) > 0.004)))
+    moving = rows_of(
+        solver.model.gaussians, np.flatnonzero(solver.rows & (opacity(solver.model.gaussians) > ALPHA_MIN))
+    )
     near = solver.bounds.near
     return [
         replace(shot, tiles=active_tiles(by_name[shot.camera.name], moving, shot.camera, near=near)) for shot in shots

@@ -37,7 +37,7 @@ SETTINGS: dict[str, Any] = {
         "opacity_weight": 0.01,
         "scale_weight": 0.01,
         "start": {"count": 300},
-        "shell": {"columns": 96, "steps": 24},
+        "shell": {"columns": 128, "steps": 24},
         "density": {"cap": 400},
     },
 }
