@@ -208,6 +208,6 @@ def _camera_to_json(camera: StudioCamera, times: CameraTimes, gains: np.ndarray)
 def _camera_from_json(name: str, item: Mapping[str, Any], folder: Path) -> CameraTruth:
     pose = np.array(item["camera_from_world"], dtype=np.float64)
     arrays = {key: np.array(item[key], np.int64) for key in _TIMES}
-    times = CameraTimes(**arrays, **{key: item[key] for key in _CLOCK})  # type: ignore[arg-type]
+    times = CameraTimes(**arrays, **{key: item[key] for key in _CLOCK})  # type: ignore[arg-type]  # from JSON
     camera = StudioCamera(name, **{key: item[key] for key in _LENS}, camera_from_world=pose)
     return CameraTruth(camera, times, np.array(item["gains"], dtype=np.float64), folder / f"{name}.npz")
