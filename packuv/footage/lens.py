@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
 from packuv.camera import PinholeCamera
+from packuv.colour import linear_from_srgb, srgb_from_linear
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """Coefficient counts that OpenCV's lens model knows, see `LensCamera.distortion`."""
@@ -49,11 +50,9 @@ class LensCamera:
 
 def gain_table(gains: tuple[float, float, float]) -> np.ndarray:
     """float32 [3, 256]: sRGB in [0, 1] of each 8-bit sRGB value times a gain in linear light."""
-    value = np.arange(256) / 255
-    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    scaled = np.clip(linear * np.asarray(gains)[:, None], 0, 1)  # [3, 256]
-    encoded = np.where(scaled <= 0.0031308, scaled * 12.92, 1.055 * scaled ** (1 / 2.4) - 0.055)
-    return np.clip(encoded, 0, 1).astype(np.float32)
+    light = linear_from_srgb(np.arange(256) / 255) * np.asarray(gains)[:, None]  # [3, 256]
+    table: np.ndarray = np.clip(srgb_from_linear(light), 0, 1).astype(np.float32)
+    return table
 
 
 def undistorted_camera(lens: LensCamera) -> PinholeCamera:
@@ -79,10 +78,7 @@ def undistorted_camera(lens: LensCamera) -> PinholeCamera:
 
 
 def _zoomed(camera: PinholeCamera, zoom: float) -> PinholeCamera:
-    return PinholeCamera(
-        camera.name, camera.width, camera.height, camera.fx * zoom, camera.fy * zoom, camera.cx, camera.cy,
-        camera.camera_from_world,
-    )  # fmt: skip
+    return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
 
 
 def _covered(lens: LensCamera, zoom: float) -> bool:
