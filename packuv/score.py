@@ -6,13 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, cast, get_origin, get_type_hints
 
 import cv2
 import numpy as np
 import pyarrow as pa
 
 from packuv.camera import PinholeCamera
+from packuv.colour import linear_from_srgb, srgb_from_linear
 from packuv.files import save_json
 from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
@@ -26,7 +27,7 @@ from packuv.scene import Scene
 class Score:
     """One picture against its truth. PSNR in dB; None where the two are equal."""
 
-    frame: int
+    frame: Annotated[int, pa.int32()]
     time_ns: int
     camera: str
     held_out: bool
@@ -44,11 +45,17 @@ class Score:
     colour: what blinks in the render but not in the truth, whatever moves. None in a first frame"""
 
 
-SCHEMA = pa.schema(
-    [("frame", pa.int32()), ("time_ns", pa.int64()), ("camera", pa.string()), ("held_out", pa.bool_())]
-    + [(name, pa.float64()) for kind in ("", "_rig", "_own") for name in (f"psnr{kind}_db", f"ssim{kind}")]
-    + [("flicker", pa.float64())]
-)  # fmt: skip
+COLUMN_TYPES = {int: pa.int64(), str: pa.string(), bool: pa.bool_(), float: pa.float64(), float | None: pa.float64()}
+"""What the table holds a field as whose annotation names no other Arrow type"""
+
+
+def _column_type(annotation: Any) -> pa.DataType:
+    return annotation.__metadata__[0] if get_origin(annotation) is Annotated else COLUMN_TYPES[annotation]
+
+
+SCHEMA = pa.schema([(name, _column_type(kind)) for name, kind in get_type_hints(Score, include_extras=True).items()])
+FIGURES = tuple(column.name for column in SCHEMA if column.type == pa.float64())
+"""Fields of which means say something"""
 
 
 def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
@@ -56,23 +63,24 @@ def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
 
     A camera without a picture at an instant is not scored there.
     """
-    artist, scores = Artist(scene), []
+    artist, scores = Artist(scene), list[Score]()
     last: dict[str, np.ndarray] = {}
     gaussians = None
     for frame in range(len(scene)):
         gaussians = scene.gaussians(frame, into=gaussians)
+        time_ns = int(scene.header.times_ns[frame])
         for index, camera in enumerate(views.cameras):
             pixels, balanced = views.pixels(index, frame), views.picture(index, frame)
-            if pixels is not None and balanced is not None:
-                truth = np.ascontiguousarray(pixels.transpose(2, 0, 1), dtype=np.float32) / 255
-                drawn = artist.draw(gaussians, camera)
-                error, before = drawn - balanced, last.get(camera.name)
-                flicker = None if before is None else float(np.abs(error - before).mean())
-                last[camera.name] = error
-                held_out = camera.name in scene.header.held_out
-                time_ns = int(scene.header.times_ns[frame])
-                values = [*_compare(drawn, truth, balanced), flicker]
-                scores.append(Score(frame, time_ns, camera.name, held_out, *values))
+            if pixels is None or balanced is None:
+                continue
+            truth = np.ascontiguousarray(pixels.transpose(2, 0, 1), dtype=np.float32) / 255
+            drawn = artist.draw(gaussians, camera)
+            error, before = drawn - balanced, last.get(camera.name)
+            flicker = None if before is None else float(np.abs(error - before).mean())
+            last[camera.name] = error
+            held_out = camera.name in scene.header.held_out
+            filmed, rig, own = _compare(drawn, truth, balanced)
+            scores.append(Score(frame, time_ns, camera.name, held_out, *filmed, *rig, *own, flicker))
         progress(frame + 1, len(scene), f"{_mean([s.psnr_rig_db for s in scores]) or 0:.2f} dB")
     return scores
 
@@ -108,19 +116,22 @@ class Artist:
     def draw(self, gaussians: Gaussians, camera: PinholeCamera) -> np.ndarray:
         """float32 [3, H, W] in [0, 1], in the rig's common colour."""
         rendering = render(gaussians, camera, options=self._options, arena=self._arena)
-        return np.clip(rendering.colour, 0, 1)
+        return cast(np.ndarray, np.clip(rendering.colour, 0, 1))
 
 
-def _compare(picture: np.ndarray, truth: np.ndarray, balanced: np.ndarray) -> list[Any]:
-    """The six figures of a `Score`."""
+Likeness = tuple[float | None, float]
+"""PSNR in dB, None where two pictures are equal, and SSIM"""
+
+
+def _compare(picture: np.ndarray, truth: np.ndarray, balanced: np.ndarray) -> tuple[Likeness, Likeness, Likeness]:
+    """Of a render to what was filmed, to that in the rig's colour, and to what was filmed after its own gain."""
     as_filmed = _likeness(picture, truth)
     # A camera that is held out has no gain: what it filmed is the rig's colour.
     in_rig = as_filmed if np.array_equal(truth, balanced) else _likeness(picture, balanced)
-    return [*as_filmed, *in_rig, *_likeness(with_own_gain(picture, truth), truth)]
+    return as_filmed, in_rig, _likeness(with_own_gain(picture, truth), truth)
 
 
-def _likeness(picture: np.ndarray, truth: np.ndarray) -> tuple[float | None, float]:
-    """PSNR, None where the two are equal, and SSIM."""
+def _likeness(picture: np.ndarray, truth: np.ndarray) -> Likeness:
     decibel = psnr(picture, truth)
     return decibel if math.isfinite(decibel) else None, ssim(picture, truth)
 
@@ -133,16 +144,7 @@ def with_own_gain(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """
     shown, wanted = picture + np.float32(0.055), truth + np.float32(0.055)
     factor = (shown * wanted).sum(axis=(1, 2)) / (shown * shown).sum(axis=(1, 2))
-    return _encoded(_linear(picture) * (factor**2.4)[:, None, None])
-
-
-def _linear(picture: np.ndarray) -> np.ndarray:
-    return np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
-
-
-def _encoded(light: np.ndarray) -> np.ndarray:
-    light = np.clip(light, 0, 1)
-    return np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055).astype(np.float32)
+    return srgb_from_linear(linear_from_srgb(picture) * (factor**2.4)[:, None, None]).astype(np.float32)
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
@@ -191,7 +193,7 @@ def _seam(scores: Sequence[Score], borders: set[int]) -> float | None:
 
 
 def _means(scores: Sequence[Score]) -> dict[str, float | None]:
-    return {name: _mean([getattr(item, name) for item in scores]) for name in SCHEMA.names[4:]}
+    return {name: _mean([getattr(item, name) for item in scores]) for name in FIGURES}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -208,12 +210,3 @@ def spread(names: Sequence[str], count: int) -> tuple[str, ...]:
     if count >= len(names):
         return tuple(names)
     return tuple(names[(2 * place + 1) * len(names) // (2 * count)] for place in range(count))
-
-
-def frames_of(scene: Scene, first: int, stop: int | None) -> range:
-    """Frames of a half-open range; raises ValueError if the scene lacks any of them."""
-    chosen = range(first, len(scene) if stop is None else stop)
-    if not chosen or chosen.stop > len(scene):
-        asked = f"{first}:{'' if stop is None else stop}"
-        raise ValueError(f"the scene has frames 0 to {len(scene) - 1}, but {asked} are asked for")
-    return chosen

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from packuv.camera import PinholeCamera
+from packuv.colour import linear_from_srgb, srgb_from_linear
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """Coefficient counts that OpenCV's lens model knows, see `LensCamera.distortion`."""
@@ -49,11 +50,8 @@ class LensCamera:
 
 def gain_table(gains: tuple[float, float, float]) -> np.ndarray:
     """float32 [3, 256]: sRGB in [0, 1] of each 8-bit sRGB value times a gain in linear light."""
-    value = np.arange(256) / 255
-    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    scaled = np.clip(linear * np.asarray(gains)[:, None], 0, 1)  # [3, 256]
-    encoded = np.where(scaled <= 0.0031308, scaled * 12.92, 1.055 * scaled ** (1 / 2.4) - 0.055)
-    table: np.ndarray = np.clip(encoded, 0, 1).astype(np.float32)
+    light = linear_from_srgb(np.arange(256) / 255) * np.asarray(gains)[:, None]  # [3, 256]
+    table: np.ndarray = np.clip(srgb_from_linear(light), 0, 1).astype(np.float32)
     return table
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipelines.commands.frames import check_frame, frames_of
 from pipelines.commands.terminal import print_facts, shown, size_text
 
 if TYPE_CHECKING:
@@ -28,11 +29,11 @@ def export_frames(arguments: argparse.Namespace) -> int:
     kind = _splat_format(arguments.format, arguments.output)
     with open_scene(arguments.scene) as scene:
         if arguments.frame is not None:
-            _check_frame(arguments.frame, len(scene))
+            check_frame(len(scene), arguments.frame)
             count = write_gaussians(arguments.output, scene.gaussians(arguments.frame), kind=kind)
             print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}")
             return 0
-        frames = _frames(arguments.frames, len(scene))
+        frames = frames_of(len(scene), arguments.frames)
         with whole_folder(arguments.output) as folder, shown(arguments, "export") as progress:
             for done, frame in enumerate(frames, start=1):
                 write_gaussians(folder / f"{frame:06d}{kind.suffix}", scene.gaussians(frame), kind=kind)
@@ -52,18 +53,6 @@ def _splat_format(name: str | None, output: Path) -> SplatFormat:
     if not found and output.suffix:
         raise ValueError(f"{output.name} does not tell its format; choose one with --format: {', '.join(SplatFormat)}")
     return found[0] if found else SplatFormat.PLY
-
-
-def _check_frame(frame: int, count: int) -> None:
-    if not 0 <= frame < count:
-        raise ValueError(f"the scene has frames 0 to {count - 1}, but frame {frame} is asked for")
-
-
-def _frames(asked: tuple[int, int | None], count: int) -> range:
-    first, stop = asked[0], count if asked[1] is None else asked[1]
-    if not first < stop <= count:
-        raise ValueError(f"the scene has frames 0 to {count - 1}, but {first}:{stop} is asked for")
-    return range(first, stop)
 
 
 def import_splats(arguments: argparse.Namespace) -> int:
@@ -191,7 +180,7 @@ def atlas(arguments: argparse.Namespace) -> int:
     from packuv.scene import open_scene
 
     with open_scene(arguments.scene) as scene:
-        _check_frame(arguments.frame, len(scene))
+        check_frame(len(scene), arguments.frame)
         picture = sheet(scene, arguments.frame, options=_uv(arguments), triplet=arguments.triplet)
     write_png(arguments.output, picture)
     what = arguments.triplet or "all triplets"

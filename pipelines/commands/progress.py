@@ -2,104 +2,84 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 import sys
 import time
 from collections.abc import Callable
-from typing import TextIO
+from typing import Protocol, TextIO
 
-from pipelines.events import Event, Forecast
+from pipelines.commands.words import LABEL_WIDTH, ending, state
+from pipelines.events import Audience, Event, Forecast
 
 LINE_SECONDS = 5.0
 """Least time between two lines of a stage where the output is not a terminal; more for what takes long"""
 LINE_SHARE = 0.05
 """Least time between two lines as a share of the stage's time so far"""
-REDRAW_SECONDS = 0.2
-LABEL_WIDTH = 16
+
+
+class Display(Audience, Protocol):
+    """An audience with something to put away."""
+
+    def close(self) -> None: ...
 
 
 class TerminalProgress:
-    """An `Audience` that writes to a terminal or, line by line, to a file."""
+    """An `Audience`: bars on a live terminal, few plain lines in a file, in a pipe and where no drawing is wanted."""
 
     def __init__(self, stream: TextIO | None = None, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self.stream = sys.stdout if stream is None else stream
-        self._live = self.stream.isatty()
-        self._clock = clock
-        self._active: dict[str, Forecast] = {}
-        self._printed: dict[str, float] = {}
-        self._drawn = -REDRAW_SECONDS
+        stream = sys.stdout if stream is None else stream
+        self._display = _display(stream, clock)
 
     def began(self, label: str, forecast: Forecast) -> None:
-        self._active[label], self._printed[label] = forecast, self._clock()
+        self._display.began(label, forecast)
 
     def moved(self, label: str, forecast: Forecast) -> None:
-        now = self._clock()
-        if self._live:
-            if now - self._drawn >= REDRAW_SECONDS:
-                self._draw()
-        elif now - self._printed[label] >= max(LINE_SECONDS, LINE_SHARE * (now - forecast.start)):
-            self._printed[label] = now
-            self._write(f"{label:<{LABEL_WIDTH}} {_state(forecast)}\n")
+        self._display.moved(label, forecast)
 
     def ended(self, event: Event) -> None:
-        self._active.pop(event.label, None)
-        self._clear()
-        self._write(f"{event.label:<{LABEL_WIDTH}} {_outcome(event)}\n")
-        self._draw()
+        self._display.ended(event)
 
     def close(self) -> None:
         """Leave the terminal with whole lines only."""
-        self._active.clear()
-        self._clear()
-
-    def _draw(self) -> None:
-        if self._live and self._active:
-            self._drawn = self._clock()
-            width = shutil.get_terminal_size().columns - 1
-            parts = [f"{label} {_state(forecast)}" for label, forecast in self._active.items()]
-            self._write("\r\x1b[K" + " · ".join(parts)[:width])
-
-    def _clear(self) -> None:
-        if self._live:
-            self._write("\r\x1b[K")
-
-    def _write(self, text: str) -> None:
-        self.stream.write(text)
-        self.stream.flush()
+        self._display.close()
 
 
-def _outcome(event: Event) -> str:
-    match event.outcome:
-        case "made":
-            return duration(event.seconds)
-        case "reused":
-            return "there already"
-        case "skipped":
-            return f"skipped: {event.reason}"
-    return "stopped" if event.stopped else "failed"
+def _display(stream: TextIO, clock: Callable[[], float]) -> Display:
+    if not is_live(stream):
+        return Lines(stream, clock)
+    from pipelines.commands.bars import Bars  # loads rich, which commands that draw nothing need not wait for
+
+    return Bars(stream, clock)
 
 
-def _state(forecast: Forecast) -> str:
-    parts = []
-    if forecast.total > 0:
-        parts.append(f"{100 * forecast.done / forecast.total:3.0f} %")
-    remaining = forecast.remaining_seconds()
-    if remaining is not None:
-        parts.append(f"{duration(remaining)} left")
-    if forecast.note:
-        parts.append(forecast.note)
-    return ", ".join(parts) or "under way"
+def is_live(stream: TextIO) -> bool:
+    """Whether it is a terminal that can be drawn on, and its owner wants that."""
+    able = os.environ.get("TERM") not in ("dumb", "unknown")
+    return stream.isatty() and able and not os.environ.get("NO_COLOR")
 
 
-def duration(seconds: float) -> str:
-    """A length of time for people.
+class Lines:
+    """A `Display` that writes whole lines only, not many of them."""
 
-    >>> [duration(s) for s in (0.04, 9.96, 75, 3720)]
-    ['0.0 s', '10.0 s', '1 min 15 s', '1 h 02 min']
-    """
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    def __init__(self, stream: TextIO, clock: Callable[[], float]) -> None:
+        self._stream = stream
+        self._clock = clock
+        self._printed: dict[str, float] = {}
+
+    def began(self, label: str, forecast: Forecast) -> None:
+        self._printed[label] = self._clock()
+
+    def moved(self, label: str, forecast: Forecast) -> None:
+        now = self._clock()
+        if now - self._printed[label] >= max(LINE_SECONDS, LINE_SHARE * (now - forecast.start)):
+            self._printed[label] = now
+            self._write(f"{label:<{LABEL_WIDTH}} {state(forecast)}")
+
+    def ended(self, event: Event) -> None:
+        self._write(ending(event))
+
+    def close(self) -> None: ...
+
+    def _write(self, line: str) -> None:
+        self._stream.write(f"{line}\n")
+        self._stream.flush()

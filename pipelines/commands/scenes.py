@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipelines.commands.frames import frames_of
 from pipelines.commands.terminal import print_facts, shown, size_text
 from pipelines.request import read_settings
 from tasks.artefacts.recipe import override
@@ -133,14 +134,14 @@ def render(arguments: argparse.Namespace) -> int:
     """`packuv render`: <frame>.png for each frame, numbered as in the scene."""
     from packuv.fit.device import choose_device
     from packuv.scene import open_scene
-    from packuv.score import Artist, frames_of, write_picture
+    from packuv.score import Artist, write_picture
 
     device = choose_device(arguments.device)
     with open_scene(arguments.scene) as scene, shown(arguments, "render") as progress:
         camera = _camera(arguments.camera, scene.header.cameras)
         if arguments.size:
             camera = camera.scaled(*arguments.size)
-        frames = frames_of(scene, *arguments.frames)
+        frames = frames_of(len(scene), arguments.frames)
         arguments.output.mkdir(parents=True, exist_ok=True)
         artist = Artist(scene, device)
         for done, frame in enumerate(frames, start=1):

@@ -209,9 +209,3 @@ def mean_by_frame(scores: Sequence[FrameScore]) -> dict[int, float]:
     for score in sorted(scores, key=lambda item: item.frame):
         frames.setdefault(score.frame, []).append(score.level_db)
     return {frame: float(np.mean(levels)) for frame, levels in frames.items()}
-
-
-# What looks wrong
-
-
-# report.json

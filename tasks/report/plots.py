@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
+from markupsafe import Markup
 
 from calibration.rig import Camera
 
@@ -56,7 +57,7 @@ def line_chart(
     marks: Sequence[float] = (),
     from_zero: bool = False,
     height: int = 260,
-) -> str:
+) -> Markup:
     """Lines over a common axis, named at their ends; `marks` are vertical lines, such as keyframes."""
     field = _field(series, from_zero, height)
     parts = [_grid(field, x_label, y_label), *(_mark(field, mark) for mark in marks)]
@@ -67,7 +68,7 @@ def line_chart(
 
 def bar_chart(
     values: Sequence[float], *, title: str, x_label: str, y_label: str, strong: Sequence[int] = (), height: int = 220
-) -> str:
+) -> Markup:
     """One bar per value, from zero; `strong` ones stand out, such as keyframes."""
     field = Field(-0.5, len(values) - 0.5, 0, _ceiling(max(values, default=0)), height)
     parts = [_grid(field, x_label, y_label)]
@@ -83,10 +84,10 @@ def bar_chart(
     return _svg(WIDTH, height, title, parts)
 
 
-def sparkline(counts: Sequence[int], *, title: str, width: int = 104, height: int = 22) -> str:
+def sparkline(counts: Sequence[int], *, title: str, width: int = 104, height: int = 22) -> Markup:
     """A histogram the height of a line; the middle bin boundary is marked."""
     if not counts:
-        return ""
+        return Markup()
     step, top = width / len(counts), max(max(counts), 1)
     bars = [
         f'<rect class="bar" x="{index * step:.2f}" y="{height - height * count / top:.2f}" '
@@ -97,7 +98,7 @@ def sparkline(counts: Sequence[int], *, title: str, width: int = 104, height: in
     return _svg(width, height, title, [middle, *bars], css="spark")
 
 
-def gain_chart(names: Sequence[str], gains: np.ndarray, *, title: str) -> str:
+def gain_chart(names: Sequence[str], gains: np.ndarray, *, title: str) -> Markup:
     """Three dots a camera, r g b, on one axis of factors about 1; gains [C, 3]."""
     height = TOP + BOTTOM + 17 * len(names)
     spread = max(0.02, float(np.abs(np.log(gains)).max()) * 1.1)
@@ -130,7 +131,7 @@ class Volume:
 
 def rig_views(
     cameras: Sequence[Camera], *, held_out: Sequence[str], volume: Volume | None, unit: str
-) -> tuple[str, str]:
+) -> tuple[Markup, Markup]:
     """The rig from above and from the side, at one scale. Up is the mean of the cameras' own up."""
     axes = np.stack(rig_axes(cameras))  # [3, 3]: across, away, up
     spots = np.array([camera.centre for camera in cameras]) @ axes.T
@@ -189,7 +190,7 @@ class RigView:
 
 def _rig_view(
     view: RigView, cameras: Sequence[Camera], held_out: Sequence[str], volume: Volume | None, unit: str
-) -> str:
+) -> Markup:
     parts = [_scale_bar(view, unit)]
     if volume:
         x, y = view.place(np.array(volume.centre))
@@ -249,8 +250,9 @@ def _scale_bar(view: RigView, unit: str) -> str:
 # Parts
 
 
-def _svg(width: float, height: float, title: str, parts: Sequence[str], css: str = "chart") -> str:
-    return (
+def _svg(width: float, height: float, title: str, parts: Sequence[str], css: str = "chart") -> Markup:
+    """Markup that templates take as it is: every name within was escaped where its text was made."""
+    return Markup(
         f'<svg class="{css}" viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{escape(title)}">'
         f"{''.join(parts)}</svg>"
     )

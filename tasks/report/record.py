@@ -34,7 +34,8 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
         "sync": report.sync and report.sync.to_json(),
         "cameras": _cameras_json(report),
         "check": report.check and report.check.to_json(),
-        "motion": report.motion and {
+        "motion": report.motion
+        and {
             "magnitude_px": [float(v) if math.isfinite(v) else None for v in report.motion.magnitude_px],
             "keyframes": list(report.motion.keyframes),
         },
@@ -45,7 +46,7 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
         "scene": report.scene and {**plain(report.scene), "mb_per_30_frames": report.scene.mb_per_30_frames},
         "pictures": [{"camera": c.camera, "frame": c.frame, "choice": c.choice} for c in report.pictures],
         "stages": [plain(stage) for stage in report.stages],
-    }  # fmt: skip
+    }
 
 
 def summary(report: ReportInput) -> dict[str, Any]:

@@ -179,9 +179,16 @@ def test_a_missing_part_says_so_and_spoils_nothing(missing: str, tmp_path: Path)
     Page(text)
     told = {name for name in SECTIONS if 'class="none"' in section(text, name)}
     expected = {
-        "sync": {"sync"}, "rig": {"rig", "colour"}, "check": set(), "motion": {"motion"}, "scores": {"quality"},
-        "scene": {"size", "gaussians"}, "pictures": {"pictures"}, "stages": {"stages", "skipped"}, "all": set(SECTIONS),
-    }  # fmt: skip
+        "sync": {"sync"},
+        "rig": {"rig", "colour"},
+        "check": set(),
+        "motion": {"motion"},
+        "scores": {"quality"},
+        "scene": {"size", "gaussians"},
+        "pictures": {"pictures"},
+        "stages": {"stages", "skipped"},
+        "all": set(SECTIONS),
+    }
     assert told == expected[missing]
     assert json.loads(files.json.read_text())["name"] == report.name
 
@@ -192,6 +199,39 @@ def test_text_is_escaped() -> None:
     assert "<script>alert" not in text
     assert "<img src=x" not in text
     assert "ring &lt;test&gt;" in text
+
+
+def test_names_and_reasons_stay_text_wherever_they_come_up() -> None:
+    """A camera's name alone is in tables, plots, tooltips, captions and findings."""
+    bad = "<script>alert('1') & \"2\"</script>"
+    report, sync, rig = make_report(), make_sync(), make_rig()
+    cameras = (replace(rig.cameras[0], name=bad, gains=(2.0, 1.0, 1.0)), *rig.cameras[1:])
+    rows = (replace(sync.cameras[0], camera=bad, drops=9), *sync.cameras[1:])
+    ugly = replace(
+        report,
+        name=bad,
+        command=bad,
+        options={"text": bad},
+        versions={bad: bad},
+        host=bad,
+        finished=bad,
+        sync=replace(sync, reference=bad, cameras=rows),
+        rig=Rig(cameras, bad),
+        held_out=(bad,),
+        scores=tuple(replace(score, camera=bad) for score in report.scores[:FRAMES]),
+        scene=replace(make_scene(), name=bad, verified=False, problem=bad),
+        pictures=tuple(replace(item, camera=bad, choice=bad) for item in report.pictures),
+        stages=tuple(
+            StageRecord(bad, outcome, 1.0, reason=bad) for outcome in (StageOutcome.FAILED, StageOutcome.SKIPPED)
+        ),
+    )
+    text = page_text(ugly)
+    assert text.count("<script") == page_text(report).count("<script") == 1
+    assert "&amp;lt;" not in text  # escaped once
+    words = Page(text).words
+    for name in ("sync", "rig", "colour", "quality", "pictures", "size", "stages", "skipped", "run"):
+        assert bad.replace(" ", "") in Page(section(text, name)).words.replace(" ", ""), name
+    assert words.count(bad) > 20
 
 
 def test_the_summary_row_shows_the_figures() -> None:
@@ -329,8 +369,10 @@ def test_first_middle_and_worst_frames_get_pictures() -> None:
     scores = [FrameScore("b", frame, level, 0.9) for frame, level in enumerate(levels)]
     scores += [FrameScore("a", 7, 20.0, 0.9)]
     assert frames_to_picture(scores[::-1]) == (
-        ("a", 7, "first, middle, worst"), ("b", 0, "first"), ("b", 2, "middle, worst"),
-    )  # fmt: skip
+        ("a", 7, "first, middle, worst"),
+        ("b", 0, "first"),
+        ("b", 2, "middle, worst"),
+    )
     assert frames_to_picture([]) == ()
 
 
@@ -377,8 +419,10 @@ def test_the_rig_is_seen_from_above_and_from_the_side() -> None:
     assert np.allclose(up, [0, 0, 1])
     assert np.allclose(np.cross(across, away), up)
     above, side = rig_views(rig.cameras, held_out=["cam2"], volume=Volume((0, 0, 0), 1.0), unit="m")
-    dots = [[(float(c.get("cx", 0)), float(c.get("cy", 0))) for c in svg_root(view).iter("circle") if c.get("r") == "3"]
-            for view in (above, side)]  # fmt: skip
+    dots = [
+        [(float(c.get("cx", 0)), float(c.get("cy", 0))) for c in svg_root(view).iter("circle") if c.get("r") == "3"]
+        for view in (above, side)
+    ]
     ring = np.hypot(*(np.array(dots[0]) - 235).T)
     assert np.allclose(ring, ring[0], atol=0.1)  # a circle from above, a line from the side; pixels have one decimal
     assert np.ptp(np.array(dots[1])[:, 1]) < 0.2

@@ -1,0 +1,297 @@
+"""What each section of the page shows, as plain values; the template of the section's name lays them out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sync.align import CameraReport, SyncReport
+from tasks.artefacts.recipe import plain
+from tasks.report.facts import FrameScore, ReportInput, StageOutcome, StageRecord, by_camera, mean_by_frame
+from tasks.report.findings import Finding, Limits
+from tasks.report.pictures import DIFFERENCE_GAIN, comparison
+from tasks.report.plots import Series, Volume, bar_chart, gain_chart, line_chart, rig_views, sparkline
+
+MANY_LINES = 6
+"""With more cameras than this, only the worst and the mean are named"""
+BAR_PX = 220
+"""The longest stage's bar"""
+
+SECTIONS = {
+    "sync": "Synchronization",
+    "rig": "Camera layout",
+    "colour": "Colour balance",
+    "motion": "Motion and keyframes",
+    "quality": "Quality over time",
+    "pictures": "Truth, render, difference",
+    "size": "Size over time",
+    "gaussians": "Gaussians over time",
+    "stages": "Time and memory",
+    "skipped": "What was skipped",
+    "run": "How this was made",
+}
+"""Id and heading, in the order of the page"""
+
+View = dict[str, Any]
+Body = View | str
+"""What a section shows, or why there is nothing to show"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One section of the page."""
+
+    name: str
+    title: str
+    findings: tuple[str, ...]
+    view: View = field(default_factory=dict)
+    missing: str = ""
+    """Why there is nothing to show"""
+
+
+def sections(report: ReportInput, found: Sequence[Finding], limits: Limits) -> list[Section]:
+    """All of them, in the order of the page."""
+    bodies: dict[str, Body] = {
+        "sync": _sync(report, limits),
+        "rig": _rig(report),
+        "colour": _colour(report),
+        "motion": _motion(report),
+        "quality": _quality(report, limits),
+        "pictures": _pictures(report),
+        "size": _size(report),
+        "gaussians": _gaussians(report),
+        "stages": _stages(report),
+        "skipped": _skipped(report),
+        "run": _run(report),
+    }
+    return [_section(name, bodies[name], found) for name in SECTIONS]
+
+
+def _section(name: str, body: Body, found: Sequence[Finding]) -> Section:
+    own = tuple(item.text for item in found if item.section == name)
+    if isinstance(body, str):
+        return Section(name, SECTIONS[name], own, missing=body)
+    return Section(name, SECTIONS[name], own, body)
+
+
+def _sync(report: ReportInput, limits: Limits) -> Body:
+    sync = report.sync
+    if sync is None:
+        return "No synchronization report: the stage did not run."
+    return {
+        "reference": sync.reference,
+        "tolerance_ms": sync.tolerance_ns / 1e6,
+        "period_ms": sync.period_ns / 1e6,
+        "clock": str(sync.clock),
+        "complete": sync.complete,
+        "instants": sync.instants,
+        "cameras": [_sync_row(row, sync, limits) for row in sync.cameras],
+    }
+
+
+def _sync_row(row: CameraReport, sync: SyncReport, limits: Limits) -> View:
+    clock = row.clock
+    return {
+        "camera": row.camera,
+        "offset_ms": clock.offset_ns / 1e6,
+        "offset_error_ms": clock.offset_error_ns / 1e6,
+        "drift_ppm": clock.drift_ppm,
+        "drift_error_ppm": clock.drift_error_ppm,
+        "state": str(clock.state),
+        "matched": row.matched,
+        "matched_share": row.matched_share,
+        "few_matched": row.matched_share < limits.matched_share,
+        "lines": row.lines,
+        "drops": row.drops,
+        "many_drops": row.drops > limits.drop_share * max(1, row.lines),
+        "duplicates": row.duplicates,
+        "reversals": row.reversals,
+        "jumps": row.jumps,
+        "residual_p95_ms": row.residual_p95_ns / 1e6,
+        "residual_median_ms": row.residual_median_ns / 1e6,
+        "late": row.residual_p95_ns > limits.residual_share * sync.period_ns > 0,
+        "residuals": sparkline(row.histogram, title=f"residuals of {row.camera}"),
+    }
+
+
+def _rig(report: ReportInput) -> Body:
+    if report.rig is None:
+        return "No calibration: the stage did not run."
+    check, rig = report.check, report.rig
+    unit = "m" if rig.metric else "units"
+    volume = Volume(check.scene_centre, check.common_radius) if check else None
+    above, side = rig_views(rig.cameras, held_out=report.held_out, volume=volume, unit=unit)
+    return {
+        "source": rig.source,
+        "unit": unit,
+        "metric": rig.metric,
+        "volume": check,
+        "above": above,
+        "side": side,
+    }
+
+
+def _colour(report: ReportInput) -> Body:
+    if report.rig is None:
+        return "No calibration: the stage did not run."
+    gains = np.array([camera.gains for camera in report.rig.cameras])
+    if (gains == 1).all():
+        return "All gains are 1: the cameras were not balanced, or did not need it."
+    chart = gain_chart([camera.name for camera in report.rig.cameras], gains, title="Colour gains")
+    return {"least": gains.min(), "most": gains.max(), "gains": chart}
+
+
+def _motion(report: ReportInput) -> Body:
+    motion = report.motion
+    if motion is None:
+        return "No motion was measured: the stage did not run."
+    count = len(motion.magnitude_px)
+    lengths = np.diff([*motion.keyframes, count]).tolist()
+    series = [Series("M(t)", range(count), [float(value) for value in motion.magnitude_px])]
+    return {
+        "segments": len(motion.keyframes),
+        "shortest": min(lengths, default=0),
+        "longest": max(lengths, default=0),
+        "curve": line_chart(
+            series, title="Motion", x_label="frame", y_label="flow, px", marks=motion.keyframes, from_zero=True
+        ),
+    }
+
+
+def _quality(report: ReportInput, limits: Limits) -> Body:
+    if not report.scores:
+        return "No picture was scored: the stage did not run, or the capture has no picture to compare with."
+    cameras = by_camera(report.scores)
+    level = {name: float(np.mean([score.level_db for score in own])) for name, own in cameras.items()}
+    low = float(np.median(list(level.values()))) - limits.camera_drop_db
+    return {
+        "held_out": bool(report.held_out),
+        "levels": line_chart(
+            _level_lines(report, cameras, level),
+            title="PSNR over time",
+            x_label="frame",
+            y_label="PSNR, dB",
+            marks=report.motion.keyframes if report.motion else (),
+            height=300,
+        ),
+        "cameras": [_score_row(name, own, level[name], low) for name, own in cameras.items()],
+    }
+
+
+def _level_lines(
+    report: ReportInput, cameras: Mapping[str, Sequence[FrameScore]], level: Mapping[str, float]
+) -> list[Series]:
+    """One line a camera, and their mean where there are several."""
+    worst = min(level, key=lambda name: level[name])
+    few = len(cameras) <= MANY_LINES
+    lines = []
+    for number, (name, own) in enumerate(cameras.items()):
+        style = f"s{number + 1}" if few else "s2" if name == worst else "muted"
+        shown = name if few or name == worst else ""
+        lines.append(Series(shown, [score.frame for score in own], [score.level_db for score in own], style))
+    if len(cameras) > 1:
+        mean = mean_by_frame(report.scores)
+        lines.append(Series("mean", list(mean), list(mean.values()), "strong"))
+    return lines
+
+
+def _score_row(camera: str, own: Sequence[FrameScore], mean_db: float, low: float) -> View:
+    worst = min(own, key=lambda score: score.level_db)
+    return {
+        "camera": camera,
+        "mean_db": mean_db,
+        "low": mean_db < low,
+        "worst_db": worst.level_db,
+        "worst_frame": worst.frame,
+        "ssim": float(np.mean([score.ssim for score in own])),
+        "pictures": len(own),
+    }
+
+
+def _pictures(report: ReportInput) -> Body:
+    if not report.pictures:
+        return "No pictures: nothing was rendered for comparison."
+    scores = {(item.camera, item.frame): item for item in report.scores}
+    return {"gain": DIFFERENCE_GAIN, "shots": [comparison(item, scores) for item in report.pictures]}
+
+
+def _size(report: ReportInput) -> Body:
+    scene = report.scene
+    if scene is None:
+        return "No scene file: the stage did not run."
+    keyframes = _keyframes(report)
+    sizes = np.array(scene.frame_bytes, dtype=np.float64) / 1e6
+    is_key = np.isin(np.arange(scene.frames), keyframes)
+    kinds = (("keyframes", is_key), ("others", ~is_key))
+    return {
+        "means": [(kind, sizes[rows].mean()) for kind, rows in kinds if rows.any()],
+        "whole_mb": scene.bytes / 1e6,
+        "overhead_mb": scene.bytes / 1e6 - sizes.sum(),
+        "frames": bar_chart(sizes.tolist(), title="Size over time", x_label="frame", y_label="MB", strong=keyframes),
+    }
+
+
+def _gaussians(report: ReportInput) -> Body:
+    scene = report.scene
+    if scene is None:
+        return "No scene file: the stage did not run."
+    frames = range(scene.frames)
+    every, dynamic = (np.array(counts) / 1000 for counts in (scene.gaussians, scene.dynamic))
+    chart = line_chart(
+        [Series("all", frames, every.tolist(), "s1"), Series("dynamic", frames, dynamic.tolist(), "s2")],
+        title="Gaussians over time",
+        x_label="frame",
+        y_label="thousands",
+        marks=_keyframes(report),
+        from_zero=True,
+    )
+    return {"dynamic_share": sum(scene.dynamic) / max(1, sum(scene.gaussians)), "counts": chart}
+
+
+def _keyframes(report: ReportInput) -> list[int]:
+    """Keyframes by the motion stage; without it, frames whose number of Gaussians changes."""
+    if report.motion:
+        return list(report.motion.keyframes)
+    counts = report.scene.gaussians if report.scene else ()
+    return [0, *(np.flatnonzero(np.diff(counts)) + 1).tolist()] if counts else []
+
+
+def _stages(report: ReportInput) -> Body:
+    ran = [stage for stage in report.stages if stage.outcome is not StageOutcome.SKIPPED]
+    if not ran:
+        return "No stage was recorded."
+    longest = max(stage.seconds for stage in ran) or 1
+    return {"seconds": sum(stage.seconds for stage in ran), "stages": [_stage_row(stage, longest) for stage in ran]}
+
+
+def _stage_row(stage: StageRecord, longest: float) -> View:
+    return {
+        "label": stage.label,
+        "seconds": stage.seconds,
+        "bar_px": max(1.0, BAR_PX * stage.seconds / longest),
+        "memory_mb": stage.peak_memory_bytes / 1e6 if stage.peak_memory_bytes else None,
+        "outcome": str(stage.outcome),
+        "failed": stage.outcome is StageOutcome.FAILED,
+        "reason": stage.reason,
+    }
+
+
+def _skipped(report: ReportInput) -> Body:
+    skipped = [stage for stage in report.stages if stage.outcome is StageOutcome.SKIPPED]
+    if not skipped:
+        return "Nothing was skipped."
+    return {"stages": [{"label": stage.label, "reason": stage.reason} for stage in skipped]}
+
+
+def _run(report: ReportInput) -> Body:
+    if not report.command and not report.versions and report.options is None:
+        return "Neither the command nor the options were recorded."
+    return {
+        "command": report.command,
+        "versions": "\n".join(f"{name:<18} {version}" for name, version in report.versions.items()),
+        "options": "" if report.options is None else json.dumps(plain(report.options), indent=1),
+    }
