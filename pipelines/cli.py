@@ -14,11 +14,14 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, NoReturn
 
+import packuv
+from pipelines import plugins
 from pipelines.request import PRESETS, QUALITIES, STAGES
 
 OK, FAILED, WRONG, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -30,7 +33,6 @@ SINGLE = {
     "encode": "write the scene file",
 }
 """Commands that run the stages up to the one they name"""
-BENCHMARKS = ("ablation", "codec", "motion", "raster", "sequence", "stress_fit", "sync_index")
 BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
 
@@ -72,12 +74,23 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}; see {self.prog} --help")
 
 
+class _Version(argparse.Action):
+    """Looks for the version when it is asked for: that takes a while, and most calls do not ask."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        print(f"packuv {packuv.__version__}")
+        parser.exit(OK)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the `packuv` command with these arguments, by default those of the process; returns the exit code."""
     try:
         arguments = parser().parse_args(argv)
         _end_gently_on_sigterm()
         return _load(arguments.function)(arguments)
+    except UsageError as error:
+        words = sys.argv[1:] if argv is None else argv
+        return _say(WRONG, (words and plugins.missing(words[0])) or error)
     except BAD_INPUT as error:
         return _say(WRONG, _system_message(error) if isinstance(error, OSError) else error)
     except KeyboardInterrupt:
@@ -131,9 +144,10 @@ def _write_log(error: Exception) -> Path:
         return Path(file.name)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The grammar of the command line."""
+def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser:
+    """The grammar of the command line, with the commands of these entry points; by default of all installed ones."""
     top = _Parser(prog="packuv", description="From a multi-camera capture to a volumetric video.")
+    top.add_argument("--version", action=_Version, nargs=0, help="print the version, and leave")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
 
     def command(name: str, function: str, text: str) -> argparse.ArgumentParser:
@@ -163,14 +177,9 @@ def parser() -> argparse.ArgumentParser:
     _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
-    _bench(command("bench", "pipelines.commands.measure:measure", "run one of the benchmarks"))
     command("doctor", "pipelines.commands.doctor:doctor", "tell what this machine has and lacks")
+    plugins.plug_in(command, lambda problem: _say(WRONG, problem), found)
     return top
-
-
-def _bench(command: argparse.ArgumentParser) -> None:
-    command.add_argument("name", choices=BENCHMARKS, metavar="NAME", help=", ".join(BENCHMARKS))
-    command.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="the benchmark's own arguments, or -h")
 
 
 def _simulate(command: argparse.ArgumentParser) -> None:
