@@ -26,6 +26,8 @@ from hypothesis import strategies as st
 from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
+from packuv.raster import RasterOptions, render
+from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.viewer import serve
 from packuv.viewer import server as viewer_server
 from packuv.viewer.server import PAGES, ViewerServer
@@ -175,23 +177,20 @@ def test_the_near_plane_is_the_scenes_own_or_scales_with_the_rig() -> None:
 
 @pytest.fixture(scope="module")
 def scene_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    scene = pytest.importorskip("packuv.scene.reader")
     folder, source = tmp_path_factory.mktemp("scene"), make_source(1)
     paths = []
     for number, part in enumerate(source.parts):
         paths.append(folder / f"{number}.npz")
         part.save(paths[-1])
-    header = scene.SceneHeader(
+    header = SceneHeader(
         source.quantizer, source.times_ns, source.rate, source.cameras, ("cam2",), extra={"near": 0.125}
     )
-    scene.write_scene(folder / "scene.mkv", paths, header)
+    write_scene(folder / "scene.mkv", paths, header)
     return folder / "scene.mkv"
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5, 6, 7), (7, 6, 5, 4, 3, 2, 1, 0), (3, 1, 6, 0, 2, 7, 5, 4)])
 def test_a_scene_file_gives_its_codes_in_any_order(scene_path: Path, order: tuple[int, ...]) -> None:
-    from packuv.scene import open_scene
-
     with open_source(scene_path) as source, open_scene(scene_path) as scene:
         keys = {number: read_key(key_bytes(source, number)) for number in (2, 0, 1)}
         for frame in order:
@@ -354,8 +353,6 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.mark.slow
 @pytest.mark.parametrize("sh_degree", [0, 3])
 def test_the_page_draws_what_the_rasterizer_draws(browser: Browser, sh_degree: int) -> None:
-    from packuv.raster import RasterOptions, render
-
     source = replace(make_source(sh_degree), near=0.1)
     camera, background = source.cameras[2], (0.2, 0.4, 0.6)
     with running(source) as server:
