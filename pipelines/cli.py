@@ -65,7 +65,9 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, formatter_class=_Help, **settings)
 
-    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def,override]
+    def parse_known_args(  # type: ignore[override]  # argparse declares an overload for each kind of namespace
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
         if self.first_words and args and args[0] not in (*self.first_words, "-h", "--help"):
             args = [self.first_words[0], *args]
         return super().parse_known_args(args, namespace)
@@ -108,7 +110,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _load(name: str) -> Callable[[argparse.Namespace], int]:
     module, _, function = name.partition(":")
-    return getattr(importlib.import_module(module), function)
+    found: Callable[[argparse.Namespace], int] = getattr(importlib.import_module(module), function)
+    return found
 
 
 def _end_gently_on_sigterm() -> None:
@@ -136,7 +139,7 @@ def _first_sentence(error: Exception) -> str:
 
 def _write_log(error: Exception) -> Path:
     """The file with the traceback: the job's own log where a job failed."""
-    log = getattr(error, "log", None)
+    log: Path | None = getattr(error, "log", None)
     if log is not None:
         return log
     with tempfile.NamedTemporaryFile("w", prefix="packuv-", suffix=".log", delete=False) as file:
@@ -236,7 +239,8 @@ def _verify(command: argparse.ArgumentParser) -> None:
 
 def _export(export: argparse.ArgumentParser) -> None:
     export.description = "Write frames, cameras or the atlas of a scene for other programs; SCENE alone means frames."
-    export.first_words = ("frames", "cameras", "atlas")  # type: ignore[attr-defined]
+    assert isinstance(export, _Parser)
+    export.first_words = ("frames", "cameras", "atlas")
     targets = export.add_subparsers(metavar="WHAT", required=True)
 
     def target(name: str, function: str, text: str) -> argparse.ArgumentParser:

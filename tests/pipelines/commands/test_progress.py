@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import doctest
 import io
 
 import pytest
 
-from pipelines.commands import progress
 from pipelines.commands.progress import LINE_SECONDS, TerminalProgress
 from pipelines.events import Forecast, Journal
 from tasks.artefacts.store import Key
@@ -29,10 +27,6 @@ class Terminal(io.StringIO):
 @pytest.fixture
 def clock():
     return Clock()
-
-
-def test_examples_in_docstrings():
-    assert doctest.testmod(progress).failed == 0
 
 
 def test_file_gets_few_whole_lines(clock):
