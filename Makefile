@@ -3,6 +3,8 @@ PYTHON ?= python3.11
 # On a machine whose index serves CUDA builds of torch first, a CPU-only set-up is:
 #   make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
 TORCH_INDEX ?=
+# More arguments of pytest: make test PYTEST='--cov -k scene'
+PYTEST ?=
 BIN := .venv/bin
 READY := .venv/.ready
 
@@ -13,7 +15,7 @@ demo: $(READY)
 	$(BIN)/packuv run runs/demo/capture --out runs/demo --preset draft --set fit.iterations=1200 --set fit.density.cap=30000
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PYTEST)
 
 test-fast: $(READY)
 	$(BIN)/python -m pytest -m "not slow"

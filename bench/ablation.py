@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bench import command
 from packuv.scene import open_scene
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
@@ -35,8 +36,12 @@ ROWS: Mapping[str, Sequence[str]] = {
     # One segment: every frame is carried on from the one before.
     "w/o keyframes": (f"keyframes.separation={_FAR}", f"keyframes.max_segment={2 * _FAR}", "keyframes.promotion=0"),
     # An ellipse without end meets the motion mask of every camera that the Gaussian stands before.
-    "w/o labeling": ("fit.labels.sigmas=1e6", "fit.labels.radius_limit_px=1e6", "fit.labels.least_overlap=0",
-                     "fit.labels.least_share=0"),
+    "w/o labeling": (
+        "fit.labels.sigmas=1e6",
+        "fit.labels.radius_limit_px=1e6",
+        "fit.labels.least_overlap=0",
+        "fit.labels.least_share=0",
+    ),
     # A map so fine that hardly two Gaussians share a texel.
     "w/o atlas": ("fit.uv.rows=4096", "fit.uv.columns=4096"),
     "w/o LPO": ("fit.low_precision=false",),
@@ -48,7 +53,7 @@ ROWS: Mapping[str, Sequence[str]] = {
     "w/o lifted motion": ("fit.lift.enabled=false",),
     "w/o depth term": ("fit.depth_weight=0",),
     "labels by OR (paper)": ("fit.labels.least_overlap=0", "fit.labels.least_share=0"),
-}  # fmt: skip
+}
 """Settings, as for `packuv run --set`, by row of the table"""
 
 
@@ -78,20 +83,30 @@ def run_row(name: str, options: AblationOptions, costs: dict[str, float]) -> dic
     """One run of the pipeline; PSNR and SSIM of the held-out cameras, MB per 30 frames, seconds of fitting."""
     settings = read_settings(None, [*options.settings, *ROWS[name]])
     request = RunRequest(
-        capture=str(options.capture), out=str(options.work), preset=options.preset, settings=settings,
-        frames=options.frames, hold_out=options.hold_out, seed=options.seed,
-    )  # fmt: skip
+        capture=str(options.capture),
+        out=str(options.work),
+        preset=options.preset,
+        settings=settings,
+        frames=options.frames,
+        hold_out=options.hold_out,
+        seed=options.seed,
+    )
     outcome = process_directly(request, Journal(TerminalProgress(sys.stderr)))
     for event in outcome.events:
         if event.key and event.outcome == "made":
             costs[str(event.key)] = event.seconds
     figures = outcome.figures
     return {
-        "row": name, "settings": list(ROWS[name]), "psnr_db": figures["psnr_db"], "ssim": figures["ssim"],
+        "row": name,
+        "settings": list(ROWS[name]),
+        "psnr_db": figures["psnr_db"],
+        "ssim": figures["ssim"],
         "mb_per_30_frames": _plain_mb(outcome) if name == "w/o codec" else figures["mb_per_30_frames"],
         "fit_seconds": _fit_seconds(outcome, costs),
-        "frames": figures["frames"], "scored_cameras": figures["scored_cameras"], "held_out": figures["held_out"],
-    }  # fmt: skip
+        "frames": figures["frames"],
+        "scored_cameras": figures["scored_cameras"],
+        "held_out": figures["held_out"],
+    }
 
 
 def _plain_mb(outcome: Outcome) -> float:
@@ -124,13 +139,15 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         change = "" if row is rows[0] else f"{row['psnr_db'] - rows[0]['psnr_db']:+.2f}"
         seconds = "" if row["fit_seconds"] is None else f"{row['fit_seconds']:.0f}"
-        lines.append(f"| {row['row']} | {row['psnr_db']:.2f} | {change} | {row['ssim']:.4f} | "
-                     f"{row['mb_per_30_frames']:.2f} | {seconds} |")  # fmt: skip
+        lines.append(
+            f"| {row['row']} | {row['psnr_db']:.2f} | {change} | {row['ssim']:.4f} | "
+            f"{row['mb_per_30_frames']:.2f} | {seconds} |"
+        )
     return "\n".join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command.parser("ablation", __doc__)
     parser.add_argument("capture", type=Path, help="capture folder")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write; the table goes beside it as .md")
     parser.add_argument("--work", type=Path, help="folder of the runs (beside --out)")
@@ -143,10 +160,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     work = given.work or given.out.with_suffix("")
     work.mkdir(parents=True, exist_ok=True)
-    options = AblationOptions(given.capture, work, tuple(given.rows), given.preset, given.frames,
-                              given.hold_out and tuple(given.hold_out), tuple(given.set), given.seed)  # fmt: skip
-    head = {"capture": given.capture.name, "preset": given.preset, "settings": given.set, "frames": given.frames,
-            "cpus": os.cpu_count(), "machine": platform.machine()}  # fmt: skip
+    options = AblationOptions(
+        given.capture,
+        work,
+        tuple(given.rows),
+        given.preset,
+        given.frames,
+        given.hold_out and tuple(given.hold_out),
+        tuple(given.set),
+        given.seed,
+    )
+    head = {
+        "capture": given.capture.name,
+        "preset": given.preset,
+        "settings": given.set,
+        "frames": given.frames,
+        "cpus": os.cpu_count(),
+        "machine": platform.machine(),
+    }
     rows: list[dict[str, Any]] = []
     for row in run(options):
         rows.append(row)

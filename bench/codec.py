@@ -29,6 +29,7 @@ from typing import Any
 import av
 import numpy as np
 
+from bench import command
 from bench.made_up import SequenceOptions, find_gaussians, make_sequence
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer
 from packuv.gaussians.segment import Segment
@@ -78,11 +79,11 @@ def measure_scene(
     frames, start = len(header.times_ns), (time.perf_counter(), time.process_time())
     encoded: list[float] = []
 
-    def note(done: int, total: int) -> None:
+    def note_half(done: float, total: float, note: str = "") -> None:
         if done == total // 2:
             encoded.extend((time.perf_counter() - start[0], time.process_time() - start[1]))
 
-    summary = write_scene(path, segments, header, options=options, threads=threads, progress=note)
+    summary = write_scene(path, segments, header, options=options, threads=threads, progress=note_half)
     written = time.perf_counter() - start[0]
     with open_scene(path, threads=threads) as scene:
         rows = [segment.rows for segment in scene.index.segments for _ in range(segment.frames)]
@@ -219,11 +220,12 @@ def _pictures(scene: Scene, track: int) -> Iterator[np.ndarray]:
 def _code(codec: Codec, pictures: Sequence[np.ndarray]) -> tuple[list[bytes], bytes | None]:
     """Packets in coding order, and the stream's own header."""
     context = av.CodecContext.create(codec.encoder, "w")
+    assert isinstance(context, av.VideoCodecContext)
     context.height, context.width = pictures[0].shape
     context.pix_fmt, context.time_base = codec.pixels, Fraction(1, 30)
     context.framerate = Fraction(30)
     context.options = dict(codec.options)
-    packets = []
+    packets: list[av.Packet[Any]] = []
     for number, picture in enumerate(pictures):
         frame = av.VideoFrame.from_ndarray(_framed(picture, codec.pixels), format=codec.pixels)
         frame.pts, frame.time_base = number, context.time_base
@@ -244,6 +246,7 @@ def _comes_back(codec: Codec, coded: tuple[list[bytes], bytes | None], pictures:
     encoder = av.CodecContext.create(codec.encoder, "w").codec
     names = {"libx264": "h264", "libx265": "hevc", "libvpx-vp9": "vp9", "libsvtav1": "libdav1d"}
     context = av.CodecContext.create(names.get(codec.encoder, encoder.name), "r")
+    assert isinstance(context, av.VideoCodecContext)
     context.extradata = header
     context.height, context.width = pictures[0].shape
     frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
@@ -289,7 +292,7 @@ def key_entropy(segment: Segment) -> dict[str, float]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m bench.codec", description=(__doc__ or "").splitlines()[0])
+    parser = command.parser("codec", __doc__)
     parser.add_argument("--scene", type=Path, help="a lossless scene file")
     parser.add_argument("--segments", type=Path, nargs="+", help="segment files; without any a sequence is made up")
     parser.add_argument("--quantizer", type=Path, help="JSON of the segments' quantizer")
@@ -302,13 +305,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--codecs", nargs="*", default=list(CODECS), choices=list(CODECS))
     for name, default in asdict(SequenceOptions()).items():
         parser.add_argument(f"--{name}", type=type(default), default=default, help="of the made-up sequence")
-    options = parser.parse_args(arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    options = parser.parse_args(words)
     if options.segments and not options.quantizer:
         parser.error("--segments needs --quantizer, the JSON that belongs to them")
     if options.plot and not options.scene:
         parser.error("--plot needs --scene, whose cameras render")
     with tempfile.TemporaryDirectory() as folder:
-        results = run(options, Path(folder))
+        results = run(options, words, Path(folder))
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(results, indent=1) + "\n")
     if options.plot:
@@ -316,7 +320,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(table(results["rows"]))
 
 
-def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def run(options: argparse.Namespace, words: Sequence[str], folder: Path) -> dict[str, Any]:
     """All measurements of one command line."""
     paths, header, source = _sequence(options, folder)
     rows = [
@@ -351,7 +355,7 @@ def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     first = Segment.load(paths[0])
     return {
         "source": source,
-        "command": shlex.join(["python", "-m", "bench.codec", *sys.argv[1:]]),
+        "command": shlex.join(["python", "-m", "bench.codec", *words]),
         "load": os.getloadavg()[0],
         "gaussians": len(first.key),
         "dynamic": int(first.dynamic.sum()),
@@ -364,6 +368,7 @@ def _sequence(options: argparse.Namespace, folder: Path) -> tuple[list[Path], Sc
     """Segment files, what the scene says, and where it is from."""
     if options.scene:
         return _unpacked(options.scene, folder)
+    source: Any
     if options.segments:
         paths, source = options.segments, "segment files"
         quantizer = Quantizer.from_json(json.loads(options.quantizer.read_text()))

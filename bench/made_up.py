@@ -66,7 +66,8 @@ def made_up_gaussians(n: int, rng: np.random.Generator) -> Gaussians:
 
 
 def _unit(quaternions: np.ndarray) -> np.ndarray:
-    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    unit: np.ndarray = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return unit
 
 
 # The sequence

@@ -10,21 +10,25 @@ that a moving part covers before or after the step: recall, and false share of t
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
 import numpy as np
 
+from bench import command
 from packuv.motion.step import DisPreset, MotionOptions, grown, measure_step, optical_flow
+
+Row = Mapping[str, Any]
+"""Of a table, by column"""
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,9 @@ class Part:
 def figure(x: float, y: float, *, speed: float, swing: float, phase: float, seed: int) -> list[Part]:
     """Legs, torso, arms and head of someone who walks with `speed` pixels a frame."""
 
-    def at(dx: float, dy: float, *, reach: float = 0.0, swings: float = 0.0) -> Callable:
+    def at(
+        dx: float, dy: float, *, reach: float = 0.0, swings: float = 0.0
+    ) -> Callable[[float], tuple[float, float, float]]:
         def pose(t: float) -> tuple[float, float, float]:
             angle = swings * swing * np.sin(0.35 * t + phase)
             return x + speed * t + dx - reach * np.sin(angle), y + dy + reach * np.cos(angle), angle
@@ -73,10 +79,13 @@ def scene() -> list[Part]:
 def texture(seed: int, contrast: float) -> np.ndarray:
     """float32 [256, 256]: grey offsets at several scales."""
     rng = np.random.default_rng(seed)
-    layers = [cv2.resize(rng.normal(size=(n, n)).astype(np.float32), (256, 256), interpolation=cv2.INTER_CUBIC)
-              for n in (16, 48, 128)]  # fmt: skip
-    total = sum(layers)
-    return contrast * total / total.std()  # type: ignore[union-attr]
+    layers = [
+        cv2.resize(rng.normal(size=(n, n)).astype(np.float32), (256, 256), interpolation=cv2.INTER_CUBIC)
+        for n in (16, 48, 128)
+    ]
+    total: np.ndarray = layers[0] + layers[1] + layers[2]
+    scaled: np.ndarray = contrast * total / total.std()
+    return scaled
 
 
 def wall(width: int, height: int) -> np.ndarray:
@@ -151,7 +160,8 @@ def true_flow(parts: list[Part], owner: np.ndarray, t: float) -> np.ndarray:
 def distance(flow: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Endpoint error, float64 [H, W], of a flow of any size."""
     full = cv2.resize(flow, truth.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    return np.linalg.norm(full - truth, axis=2)
+    error: np.ndarray = np.linalg.norm(full - truth, axis=2)
+    return error
 
 
 @dataclass(frozen=True)
@@ -198,7 +208,7 @@ def optical_flow_of(pair: Pair, options: MotionOptions) -> np.ndarray:
     return optical_flow(pair.before, pair.after, options)
 
 
-def flow_rows(clip: list[Pair]) -> Iterator[dict]:
+def flow_rows(clip: list[Pair]) -> Iterator[Row]:
     """Time and endpoint error by flow width and DIS preset."""
     for width in (160, 240, 320, 480, 640):
         for preset in DisPreset:
@@ -220,13 +230,15 @@ def flow_rows(clip: list[Pair]) -> Iterator[dict]:
 def flow_mask(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
     """The paper's mask before dilation."""
     speed = np.linalg.norm(optical_flow(pair.before, pair.after, options), axis=2)
-    return cv2.resize(speed, pair.before.shape[::-1]) > tau_px
+    fast: np.ndarray = cv2.resize(speed, pair.before.shape[::-1]) > tau_px
+    return fast
 
 
 def both_ways(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
     """|flow| > tau, forward or backward: where things were and where they are."""
     back = Pair(pair.after, pair.before, pair.flow, pair.was, pair.moved, pair.far)
-    return flow_mask(pair, tau_px, options) | flow_mask(back, tau_px, options)
+    either: np.ndarray = flow_mask(pair, tau_px, options) | flow_mask(back, tau_px, options)
+    return either
 
 
 def splatted(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
@@ -243,8 +255,9 @@ def splatted(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
 def flow_near_change(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
     """|flow| > tau within 6 px of change, and change itself."""
     width, height = pair.before.shape[::-1]
-    mask = grown(measure_step(pair.before, pair.after, options).mask, width, height, 0)
-    return mask | flow_mask(pair, tau_px, options) & grown(mask, width, height, 6 * width // 640)
+    mask: np.ndarray = grown(measure_step(pair.before, pair.after, options).mask, width, height, 0)
+    mask |= flow_mask(pair, tau_px, options) & grown(mask, width, height, 6 * width // 640)
+    return mask
 
 
 def change(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
@@ -253,7 +266,7 @@ def change(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
     return grown(mask, pair.before.shape[1], pair.before.shape[0], 0)
 
 
-def mask_rows(clip: list[Pair]) -> Iterator[dict]:
+def mask_rows(clip: list[Pair]) -> Iterator[Row]:
     """Time, recall and false alarms by kind of mask; all are dilated by 3 px at 640 wide."""
     options, (height, width) = MotionOptions(), clip[0].before.shape
     for method in (flow_mask, both_ways, splatted, flow_near_change, change):
@@ -271,7 +284,7 @@ def mask_rows(clip: list[Pair]) -> Iterator[dict]:
             }
 
 
-def table(rows: list[dict]) -> str:
+def table(rows: Sequence[Row]) -> str:
     """Rows with equal keys as aligned text."""
     texts = [[f"{v:.3f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
     widths = [max(len(cell) for cell in column) for column in zip(list(rows[0]), *texts, strict=True)]
@@ -279,24 +292,24 @@ def table(rows: list[dict]) -> str:
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = command.parser("motion", __doc__)
     parser.add_argument("--out", type=Path, help="write all figures as JSON")
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--size", default="640x360")
     parser.add_argument("--crf", type=int, nargs="+", default=[18, 23, 28])
-    arguments = parser.parse_args()
-    width, height = map(int, arguments.size.split("x"))
+    given = parser.parse_args(arguments)
+    width, height = map(int, given.size.split("x"))
     cv2.setNumThreads(1)
-    result: dict[str, list[dict]] = {}
-    for crf in arguments.crf:
-        clip = pairs(arguments.frames, width, height, crf)
+    result: dict[str, list[Row]] = {}
+    for crf in given.crf:
+        clip = pairs(given.frames, width, height, crf)
         parts = {"masks": mask_rows} if result else {"flow": flow_rows, "masks": mask_rows}
         for name, rows in parts.items():
             result[f"{name}, crf {crf}"] = list(rows(clip))
             print(f"\n{name}, {width}x{height}, crf {crf}\n{table(result[f'{name}, crf {crf}'])}", flush=True)
-    if arguments.out:
-        arguments.out.write_text(json.dumps(result, indent=1))
+    if given.out:
+        given.out.write_text(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ processes disturb least; with more they are wall time. Compare rows of one run.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -30,6 +29,7 @@ import numba
 import numpy as np
 from numba import njit
 
+from bench import command
 from packuv.camera import PinholeCamera
 from packuv.fit.adam import AdamState, adam_step
 from packuv.fit.device import choose_device
@@ -52,10 +52,18 @@ from packuv.raster import (
 )
 
 STAGES = (
-    (cpu, "project"), (bins, "drawn"), (bins, "sort_by_depth"), (bins, "running_sum"), (bins, "find_tiles"),
-    (bins, "count_pairs"), (bins, "start_tiles"), (bins, "scatter_pairs"), (blend, "blend"), (blend, "blend_backward"),
+    (cpu, "project"),
+    (bins, "drawn"),
+    (bins, "sort_by_depth"),
+    (bins, "running_sum"),
+    (bins, "find_tiles"),
+    (bins, "count_pairs"),
+    (bins, "start_tiles"),
+    (bins, "scatter_pairs"),
+    (blend, "blend"),
+    (blend, "blend_backward"),
     (cpu, "project_backward"),
-)  # fmt: skip
+)
 """Kernels of a rendering and its gradients, in order"""
 FORWARD_FLOPS, BACKWARD_FLOPS = 34, 58
 """Floating-point operations per pixel and Gaussian in the loops over blocks; fused ones count two, comparisons none"""
@@ -122,7 +130,7 @@ def _camera(translation: np.ndarray, focal: float, options: BenchOptions) -> Pin
 Clock = Callable[[], float]
 
 
-def timed(clock: Clock, samples: list[float], work: Callable, *arguments: Any, **options: Any) -> Any:
+def timed(clock: Clock, samples: list[float], work: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
     """Call something, and note how many milliseconds it took."""
     start = clock()
     result = work(*arguments, **options)
@@ -170,8 +178,16 @@ class Iteration:
     def run(self, tiles: np.ndarray | None = None, rows: np.ndarray | None = None) -> Rendering:
         """Render, compare, differentiate, step; the times go to `times`."""
         clock, times, target = self.clock, self.times, self.target
-        drawn = timed(clock, times["forward"], render, self.gaussians, self.camera, options=self.raster,
-                      arena=self.work, tiles=tiles)  # fmt: skip
+        drawn: Rendering = timed(
+            clock,
+            times["forward"],
+            render,
+            self.gaussians,
+            self.camera,
+            options=self.raster,
+            arena=self.work,
+            tiles=tiles,
+        )
         loss = timed(
             clock, times["loss"], photometric_loss, drawn.colour, target, options=PhotometricOptions(), tiles=tiles
         )
@@ -200,10 +216,14 @@ def measure_iteration(
             drawn = iteration.run()
     per_repeat = {name: np.reshape(samples, (options.repeats, -1)).sum(1).tolist() for name, samples in stages.items()}
     return {
-        "threads": threads, "clock": clock.__name__, "visible": int((drawn.visible > 0).sum()),
-        "pairs": drawn.pair_count, "evaluations": drawn.evaluation_count, "iteration": iteration.summary(),
+        "threads": threads,
+        "clock": clock.__name__,
+        "visible": int((drawn.visible > 0).sum()),
+        "pairs": drawn.pair_count,
+        "evaluations": drawn.evaluation_count,
+        "iteration": iteration.summary(),
         "stages": {name: summary(samples) for name, samples in per_repeat.items()},
-    }  # fmt: skip
+    }
 
 
 def measure_device(gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions, device: str) -> dict[str, Any]:
@@ -213,8 +233,17 @@ def measure_device(gaussians: Gaussians, camera: PinholeCamera, options: BenchOp
     cameras, masks, labels = [camera] * options.views, [mask] * options.views, list[float]()
     for _ in range(options.repeats + 1):
         iteration.run()
-        timed(time.perf_counter, labels, count_hits, gaussians, cameras, masks, near=0.05, options=LabelOptions(),
-              device=device)  # fmt: skip
+        timed(
+            time.perf_counter,
+            labels,
+            count_hits,
+            gaussians,
+            cameras,
+            masks,
+            near=0.05,
+            options=LabelOptions(),
+            device=device,
+        )
     for samples in (*iteration.times.values(), labels):
         del samples[0]  # compiles
     return {"device": device, "iteration": iteration.summary(), "labels": summary(labels), "views": options.views}
@@ -229,8 +258,14 @@ def measure_shares(gaussians: Gaussians, camera: PinholeCamera, options: BenchOp
         iteration = Iteration(gaussians, camera, options, time.process_time)
         for _ in range(options.repeats):
             drawn = iteration.run(tiles, rows)
-        out.append({"tiles": float(tiles.mean()), "rows": float(rows.mean()), "evaluations": drawn.evaluation_count,
-                    **iteration.summary()})  # fmt: skip
+        out.append(
+            {
+                "tiles": float(tiles.mean()),
+                "rows": float(rows.mean()),
+                "evaluations": drawn.evaluation_count,
+                **iteration.summary(),
+            }
+        )
     return out
 
 
@@ -244,7 +279,7 @@ def _rectangle(shape: tuple[int, int], share: float) -> np.ndarray:
 
 
 @njit(error_model="numpy")
-def _multiply_and_add(count, start):
+def _multiply_and_add(count: int, start: np.float32) -> Any:
     a, b, c, d, e = splat(start), splat(2 * start), splat(3 * start), splat(4 * start), splat(5 * start)
     x, y = splat(np.float32(0.999)), splat(start)
     for _ in range(count):
@@ -282,8 +317,13 @@ def measure_compiler() -> dict[str, dict[str, float]]:
     out = {}
     with tempfile.TemporaryDirectory() as folder:
         for name in ("cold", "warm"):
-            run = subprocess.run([sys.executable, "-c", FIRST_CALLS], env={**os.environ, "NUMBA_CACHE_DIR": folder},
-                                 capture_output=True, text=True, check=True)  # fmt: skip
+            run = subprocess.run(
+                [sys.executable, "-c", FIRST_CALLS],
+                env={**os.environ, "NUMBA_CACHE_DIR": folder},
+                capture_output=True,
+                text=True,
+                check=True,
+            )
             names = ("import_cpu_seconds", "first_calls_wall_seconds", "cpu_seconds")
             values = [round(float(word), 2) for word in run.stdout.split()]
             out[name] = dict(zip(names, values, strict=True))
@@ -306,17 +346,27 @@ def run(options: BenchOptions, ply: Path | None = None, device: str = "cpu") -> 
     camera = trained_camera(gaussians, options) if ply else room_camera(options)
     call_everything()
     peak = peak_gflops(options.repeats)
-    config: Any = numba.config
-    iterations = [measure_iteration(gaussians, camera, options, n) for n in sorted({1, config.NUMBA_NUM_THREADS})]
+    compiler: Any = numba  # whose stubs leave these two out
+    iterations = [
+        measure_iteration(gaussians, camera, options, n) for n in sorted({1, compiler.config.NUMBA_NUM_THREADS})
+    ]
     return {
-        "options": asdict(options), "scene": ply.name if ply else "room", "gaussians": len(gaussians),
-        "machine": {"cpu": llvmlite.binding.get_host_cpu_name(), "system": platform.platform(),
-                    "threading_layer": numba.threading_layer(), "load": os.getloadavg()[0]},
-        "peak_gflops_per_core": round(peak, 1), "iterations": iterations,
+        "options": asdict(options),
+        "scene": ply.name if ply else "room",
+        "gaussians": len(gaussians),
+        "machine": {
+            "cpu": llvmlite.binding.get_host_cpu_name(),
+            "system": platform.platform(),
+            "threading_layer": compiler.threading_layer(),
+            "load": os.getloadavg()[0],
+        },
+        "peak_gflops_per_core": round(peak, 1),
+        "iterations": iterations,
         "throughput": [throughput(measured, peak) for measured in iterations],
-        "active_tiles": measure_shares(gaussians, camera, options), "compiler": measure_compiler(),
+        "active_tiles": measure_shares(gaussians, camera, options),
+        "compiler": measure_compiler(),
         "devices": [measure_device(gaussians, camera, options, name) for name in devices],
-    }  # fmt: skip
+    }
 
 
 def report(result: dict[str, Any]) -> Iterator[str]:
@@ -330,10 +380,10 @@ def report(result: dict[str, Any]) -> Iterator[str]:
         for name, rate in rates.items():
             speed, share = rate.values()
             yield f"  {name}: {speed} G evaluations/s/core, {share:.0%} of peak"
-    columns = ("forward", "loss", "backward", "adam")
-    yield f"active tiles: {', '.join(columns)} (ms, least)"
+    parts = ("forward", "loss", "backward", "adam")
+    yield f"active tiles: {', '.join(parts)} (ms, least)"
     for row in result["active_tiles"]:
-        yield f"  {row['tiles']:6.1%} " + " ".join(f"{row[name]['min_ms']:8.2f}" for name in columns)
+        yield f"  {row['tiles']:6.1%} " + " ".join(f"{row[name]['min_ms']:8.2f}" for name in parts)
     for row in result["devices"]:
         columns = {**row["iteration"], f"labels in {row['views']} views": row["labels"]}
         yield f"{row['device']}, wall: " + ", ".join(f"{name} {v['median_ms']:.2f}" for name, v in columns.items())
@@ -341,7 +391,7 @@ def report(result: dict[str, Any]) -> Iterator[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command.parser("raster", __doc__)
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--ply", type=Path, help="a trained scene instead of the made-up room")
     parser.add_argument("--size", default="640x360", help="of the picture, WxH")

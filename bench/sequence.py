@@ -8,7 +8,6 @@ Seconds and memory are those of the artefacts of the run, whenever they were mad
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 import pyarrow.ipc
 
+from bench import command
 from pipelines.process import RUN
 
 _KEY_FIGURES = ("seconds", "iterations", "gaussians", "changed", "saturated", "guarded")
@@ -89,7 +89,7 @@ def _transitions(segments: Sequence[Path]) -> dict[str, float]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command.parser("sequence", __doc__)
     parser.add_argument("run", type=Path, help="folder of a finished run: <out>/<sequence>")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     given = parser.parse_args(arguments)

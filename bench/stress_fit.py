@@ -10,7 +10,6 @@ along the way.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import tempfile
@@ -23,6 +22,7 @@ from typing import Any
 import av
 import numpy as np
 
+from bench import command
 from packuv.camera import PinholeCamera
 from packuv.fit.density import DensityOptions
 from packuv.fit.frames import fit_segment
@@ -62,10 +62,18 @@ class StressOptions:
     """Of each case"""
     seconds: float = np.inf
     """No new segment is begun after this time; the result tells how many frames were fitted"""
-    fit: FitOptions = field(default_factory=lambda: FitOptions(
-        iterations=150, key_iterations=24, frame_iterations=12, spare=40, key_births=40, near_jitter=0.0,
-        start=StartOptions(count=400), density=DensityOptions(cap=600, every=25),
-    ))  # fmt: skip
+    fit: FitOptions = field(
+        default_factory=lambda: FitOptions(
+            iterations=150,
+            key_iterations=24,
+            frame_iterations=12,
+            spare=40,
+            key_births=40,
+            near_jitter=0.0,
+            start=StartOptions(count=400),
+            density=DensityOptions(cap=600, every=25),
+        )
+    )
 
 
 # -- scenes -----------------------------------------------------------------------------------------------------------
@@ -103,9 +111,12 @@ def ball_scene(instant: int) -> Gaussians:
 
 
 def film(
-    folder: Path, cameras: Sequence[PinholeCamera], frames: int, scene: Callable[[int], Gaussians] = ball_scene,
+    folder: Path,
+    cameras: Sequence[PinholeCamera],
+    frames: int,
+    scene: Callable[[int], Gaussians] = ball_scene,
     missing: Sequence[tuple[int, int]] = (),
-) -> Views:  # fmt: skip
+) -> Views:
     """Lossless videos of a scene under `folder`; (instant, camera) pairs in `missing` have no picture."""
     for camera in cameras:
         with av.open(str(folder / f"{camera.name}.mkv"), "w") as container:
@@ -171,17 +182,28 @@ def absurd_starts(cameras: Sequence[PinholeCamera]) -> Iterator[tuple[str, Gauss
     """A sound cloud of which every third Gaussian is absurd, by name."""
     third = slice(None, None, 3)
     for name, column, value in (
-        ("huge scales", "log_scales", 8.0), ("scales beyond the exponent", "log_scales", 200.0),
-        ("tiny scales", "log_scales", -30.0), ("needles", "log_scales", [-25.0, -25.0, 1.0]),
-        ("saturated opacity", "opacity_logits", 60.0), ("no opacity", "opacity_logits", -60.0),
-        ("zero quaternions", "quaternions", 0.0), ("long quaternions", "quaternions", 1e15),
-        ("not a number", "means", np.nan), ("infinite colours", "sh", np.inf), ("glaring colours", "sh", 1e3),
-    ):  # fmt: skip
+        ("huge scales", "log_scales", 8.0),
+        ("scales beyond the exponent", "log_scales", 200.0),
+        ("tiny scales", "log_scales", -30.0),
+        ("needles", "log_scales", [-25.0, -25.0, 1.0]),
+        ("saturated opacity", "opacity_logits", 60.0),
+        ("no opacity", "opacity_logits", -60.0),
+        ("zero quaternions", "quaternions", 0.0),
+        ("long quaternions", "quaternions", 1e15),
+        ("not a number", "means", np.nan),
+        ("infinite colours", "sh", np.inf),
+        ("glaring colours", "sh", 1e3),
+    ):
         start = jittered(cloud())
         getattr(start, column)[third] = value
         yield name, start
-    for name, distance in (("behind the camera", -0.5), ("on the camera's plane", 0.0), ("at the lens", 1e-6),
-                           ("before the near plane", 0.05), ("just behind the near plane", 0.09)):  # fmt: skip
+    for name, distance in (
+        ("behind the camera", -0.5),
+        ("on the camera's plane", 0.0),
+        ("at the lens", 1e-6),
+        ("before the near plane", 0.05),
+        ("just behind the near plane", 0.09),
+    ):
         start = jittered(cloud())
         rows = np.arange(0, len(start), 3)
         chosen = [cameras[int(row) % len(cameras)] for row in rows]
@@ -204,15 +226,18 @@ def run_cases(options: StressOptions) -> dict[str, dict[str, Any]]:
     for quantized in (False, True):
         kind = "codes" if quantized else "floats"
         for name, start in absurd_starts(cameras):
-            out[f"{name}, {kind}"] = fit_case(start, cameras, targets, iterations=options.iterations,
-                                              quantized=quantized)  # fmt: skip
+            out[f"{name}, {kind}"] = fit_case(
+                start, cameras, targets, iterations=options.iterations, quantized=quantized
+            )
         for name, value in (("black pictures", 0.0), ("white pictures", 1.0), ("grey pictures", 0.5)):
             even = [np.full(shape, value, np.float32)] * len(cameras)
-            out[f"{name}, {kind}"] = fit_case(jittered(cloud()), cameras, even, iterations=options.iterations,
-                                              quantized=quantized)  # fmt: skip
+            out[f"{name}, {kind}"] = fit_case(
+                jittered(cloud()), cameras, even, iterations=options.iterations, quantized=quantized
+            )
         for scale in (1.0, 1e6, 1e-3):
-            out[f"scene times {scale:g}, {kind}"] = fit_scaled(scale, iterations=options.iterations,
-                                                              count=options.cameras, quantized=quantized)  # fmt: skip
+            out[f"scene times {scale:g}, {kind}"] = fit_scaled(
+                scale, iterations=options.iterations, count=options.cameras, quantized=quantized
+            )
     return {name: asdict(outcome) for name, outcome in out.items()}
 
 
@@ -265,8 +290,8 @@ def _next_key(key: KeyState, views: Views, instant: int, stills: Sequence[Still]
 
 def _score(gaussians: Gaussians, instant: int, judges: Sequence[PinholeCamera], bounds: Bounds) -> float:
     truth = ball_scene(instant)
-    return float(np.mean([psnr(np.clip(picture_of(gaussians, camera, near=bounds.near), 0, 1),
-                               np.clip(picture_of(truth, camera), 0, 1)) for camera in judges]))  # fmt: skip
+    drawn = [(picture_of(gaussians, camera, near=bounds.near), picture_of(truth, camera)) for camera in judges]
+    return float(np.mean([psnr(np.clip(shown, 0, 1), np.clip(wanted, 0, 1)) for shown, wanted in drawn]))
 
 
 def own_memory_mb() -> float:
@@ -294,31 +319,45 @@ def run_sequence(options: StressOptions) -> dict[str, Any]:
         found = fit_sequence(views, motion, folder, options, judges=[unseen])
     values = found["psnr_db"]
     return {
-        "frames": len(values), "segment": options.segment, "side_by_side": options.side_by_side,
+        "frames": len(values),
+        "segment": options.segment,
+        "side_by_side": options.side_by_side,
         "fit_seconds": round(time.monotonic() - started, 1),
-        "unseen_psnr_db": {"mean": round(float(np.mean(values)), 3), "least": round(min(values), 3),
-                           "first_50": round(float(np.mean(values[:50])), 3),
-                           "last_50": round(float(np.mean(values[-50:])), 3), "drift": round(drift_db(values), 3)},
-        "per_segment": {"psnr_db": [round(float(np.mean(values[i : i + options.segment])), 2)
-                                    for i in range(0, len(values), options.segment)],
-                        **{name: column for name, column in found.items() if name != "psnr_db"}},
-    }  # fmt: skip
+        "unseen_psnr_db": {
+            "mean": round(float(np.mean(values)), 3),
+            "least": round(min(values), 3),
+            "first_50": round(float(np.mean(values[:50])), 3),
+            "last_50": round(float(np.mean(values[-50:])), 3),
+            "drift": round(drift_db(values), 3),
+        },
+        "per_segment": {
+            "psnr_db": [
+                round(float(np.mean(values[i : i + options.segment])), 2)
+                for i in range(0, len(values), options.segment)
+            ],
+            **{name: column for name, column in found.items() if name != "psnr_db"},
+        },
+    }
 
 
 def report(result: Mapping[str, Any]) -> Iterator[str]:
     """Lines for people."""
     for name, outcome in result["cases"].items():
-        yield (f"{name:44} loss {outcome['first_loss']:.4f} -> {outcome['last_loss']:.4f}, "
-               f"{outcome['guarded']} guarded{'' if outcome['finite'] else ', NOT FINITE'}")  # fmt: skip
+        yield (
+            f"{name:44} loss {outcome['first_loss']:.4f} -> {outcome['last_loss']:.4f}, "
+            f"{outcome['guarded']} guarded{'' if outcome['finite'] else ', NOT FINITE'}"
+        )
     sequence = result["sequence"]
     quality, memory = sequence["unseen_psnr_db"], sequence["per_segment"]["memory_mb"]
-    yield (f"{sequence['frames']} frames in {sequence['fit_seconds']} s: unseen camera {quality['mean']} dB, drift "
-           f"{quality['drift']} dB from the first to the last 50 frames")  # fmt: skip
+    yield (
+        f"{sequence['frames']} frames in {sequence['fit_seconds']} s: unseen camera {quality['mean']} dB, drift "
+        f"{quality['drift']} dB from the first to the last 50 frames"
+    )
     yield f"Gaussians per segment {sequence['per_segment']['gaussians']}, memory {memory[0]} -> {memory[-1]} MB"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command.parser("stress_fit", __doc__)
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--frames", type=int, default=StressOptions.frames)
     parser.add_argument("--segment", type=int, default=StressOptions.segment)

@@ -9,13 +9,12 @@ seconds, the best of several repeats: nothing here runs in parallel, and other w
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 from sortedcontainers import SortedDict
 
+from bench import command
 from sync.align import AlignOptions, align, build_index, load_index, save_index
 from sync.clock import ClockMode
 from sync.timecode import Timecodes, read_timecodes
@@ -81,9 +81,13 @@ def compare_structures(frames: int, seed: int, repeats: int) -> list[dict[str, A
     rows = []
 
     def row(
-        name: str, build: Callable[[], Any] | None, find: Callable[[np.ndarray], Any], size: float | None = None,
-        *, any_order: bool = True,
-    ) -> None:  # fmt: skip
+        name: str,
+        build: Callable[[], Any] | None,
+        find: Callable[[np.ndarray], Any],
+        size: float | None = None,
+        *,
+        any_order: bool = True,
+    ) -> None:
         found = np.asarray(find(queries))
         if not np.array_equal(found, expected):
             raise AssertionError(f"{name} differs from numpy in {(found != expected).sum()} answers")
@@ -171,14 +175,14 @@ def print_tables(rows: list[dict[str, Any]], rig: dict[str, float]) -> None:
         )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = command.parser("sync_index", __doc__)
     parser.add_argument("--out", type=Path, required=True, help="where the JSON goes")
     parser.add_argument("--frames", type=int, default=162_000, help="frames per camera")
     parser.add_argument("--cameras", type=int, default=8, help="cameras of the whole rig")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     rows = compare_structures(args.frames, args.seed, args.repeats)
     rig = whole_rig(args.cameras, args.frames, args.seed, args.repeats)
     print_tables(rows, rig)

@@ -14,12 +14,15 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, NoReturn
 
+import packuv
 from packuv.gaussians.uvsize import UvOptions
+from pipelines import plugins
 from pipelines.request import PRESETS, QUALITIES, STAGES
 
 OK, FAILED, WRONG, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -31,7 +34,6 @@ SINGLE = {
     "encode": "write the scene file",
 }
 """Commands that run the stages up to the one they name"""
-BENCHMARKS = ("ablation", "codec", "motion", "raster", "sequence", "stress_fit", "sync_index")
 BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
 
@@ -64,7 +66,9 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, formatter_class=_Help, **settings)
 
-    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def,override]
+    def parse_known_args(  # type: ignore[override]  # argparse declares an overload for each kind of namespace
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
         if self.first_words and args and args[0] not in (*self.first_words, "-h", "--help"):
             args = [self.first_words[0], *args]
         return super().parse_known_args(args, namespace)
@@ -73,12 +77,23 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}; see {self.prog} --help")
 
 
+class _Version(argparse.Action):
+    """Looks for the version when it is asked for: that takes a while, and most calls do not ask."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        print(f"packuv {packuv.__version__}")
+        parser.exit(OK)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the `packuv` command with these arguments, by default those of the process; returns the exit code."""
     try:
         arguments = parser().parse_args(argv)
         _end_gently_on_sigterm()
         return _load(arguments.function)(arguments)
+    except UsageError as error:
+        words = sys.argv[1:] if argv is None else argv
+        return _say(WRONG, (words and plugins.missing(words[0])) or error)
     except BAD_INPUT as error:
         return _say(WRONG, _system_message(error) if isinstance(error, OSError) else error)
     except KeyboardInterrupt:
@@ -96,7 +111,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _load(name: str) -> Callable[[argparse.Namespace], int]:
     module, _, function = name.partition(":")
-    return getattr(importlib.import_module(module), function)
+    found: Callable[[argparse.Namespace], int] = getattr(importlib.import_module(module), function)
+    return found
 
 
 def _end_gently_on_sigterm() -> None:
@@ -124,7 +140,7 @@ def _first_sentence(error: Exception) -> str:
 
 def _write_log(error: Exception) -> Path:
     """The file with the traceback: the job's own log where a job failed."""
-    log = getattr(error, "log", None)
+    log: Path | None = getattr(error, "log", None)
     if log is not None:
         return log
     with tempfile.NamedTemporaryFile("w", prefix="packuv-", suffix=".log", delete=False) as file:
@@ -132,9 +148,10 @@ def _write_log(error: Exception) -> Path:
         return Path(file.name)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The grammar of the command line."""
+def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser:
+    """The grammar of the command line, with the commands of these entry points; by default of all installed ones."""
     top = _Parser(prog="packuv", description="From a multi-camera capture to a volumetric video.")
+    top.add_argument("--version", action=_Version, nargs=0, help="print the version, and leave")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
 
     def command(name: str, function: str, text: str) -> argparse.ArgumentParser:
@@ -164,14 +181,9 @@ def parser() -> argparse.ArgumentParser:
     _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
-    _bench(command("bench", "pipelines.commands.measure:measure", "run one of the benchmarks"))
     command("doctor", "pipelines.commands.doctor:doctor", "tell what this machine has and lacks")
+    plugins.plug_in(command, lambda problem: _say(WRONG, problem), found)
     return top
-
-
-def _bench(command: argparse.ArgumentParser) -> None:
-    command.add_argument("name", choices=BENCHMARKS, metavar="NAME", help=", ".join(BENCHMARKS))
-    command.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="the benchmark's own arguments, or -h")
 
 
 def _simulate(command: argparse.ArgumentParser) -> None:
@@ -228,7 +240,8 @@ def _verify(command: argparse.ArgumentParser) -> None:
 
 def _export(export: argparse.ArgumentParser) -> None:
     export.description = "Write frames, cameras or the atlas of a scene for other programs; SCENE alone means frames."
-    export.first_words = ("frames", "cameras", "atlas")  # type: ignore[attr-defined]
+    assert isinstance(export, _Parser)
+    export.first_words = ("frames", "cameras", "atlas")
     targets = export.add_subparsers(metavar="WHAT", required=True)
 
     def target(name: str, function: str, text: str) -> argparse.ArgumentParser:

@@ -6,15 +6,28 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.needs import need, need_data, promised
 from tests.support.places import DATA
+
+
+def pytest_configure() -> None:
+    """A misspelt promise must not pass for none."""
+    try:
+        promised()
+    except ValueError as error:
+        raise pytest.UsageError(error) from None
+
+
+@pytest.hookimpl(tryfirst=True)  # before fixtures that only work where the need is met
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    for mark in item.iter_markers("need"):
+        need(*mark.args)
 
 
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder with recorded captures; tests that need them skip where it is absent."""
-    if not DATA.is_dir():
-        pytest.skip(f"no recorded captures at {DATA}; set PACKUV_DATA")
-    return DATA
+    return need_data(DATA)
 
 
 @pytest.fixture(scope="session")

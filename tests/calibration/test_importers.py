@@ -20,6 +20,7 @@ from calibration.exporters import write_colmap, write_poses_bounds, write_transf
 from calibration.importers import load_rig
 from calibration.rig import Camera, Rig
 from tests.support.calibration_scene import arc, look_at, ring
+from tests.support.needs import need_data
 
 # Rotations pass through quaternions or an inverse: a few roundings of numbers near 1, and of translations near 1e3.
 POSE_TOLERANCE = 1e-9
@@ -418,19 +419,17 @@ def test_unusable_easymocap_files_say_what_is_missing(tmp_path):
 
 
 def test_fox_photographs_are_chosen_by_name(data):
-    if not (data / "fox").is_dir():
-        pytest.skip("no fox photographs among the recorded captures")
-    names = sorted(path.stem for path in (data / "fox/images").iterdir())
-    rig = load_rig(data / "fox/transforms.json", names)
+    fox = need_data(data / "fox")
+    names = sorted(path.stem for path in (fox / "images").iterdir())
+    rig = load_rig(fox / "transforms.json", names)
     assert rig.names == tuple(names)
     assert len(rig.cameras) == 50
     assert rig.cameras[0].distortion == (0.0578421, -0.0805099, -0.000980296, 0.00015575)
 
 
 def test_webcams_of_both_caliscope_layouts(data):
-    if not (data / "webcams").is_dir():
-        pytest.skip("no webcams among the recorded captures")
-    new, old = (load_rig(data / "webcams" / name) for name in ("camera_array.toml", "config.toml"))
+    webcams = need_data(data / "webcams")
+    new, old = (load_rig(webcams / name) for name in ("camera_array.toml", "config.toml"))
     assert new.names == old.names == ("cam_0", "cam_1", "cam_2", "cam_3")
     assert all(
         np.allclose(a.camera_from_world, b.camera_from_world) for a, b in zip(new.cameras, old.cameras, strict=True)

@@ -15,6 +15,7 @@ from calibration.features import FeatureOptions
 from calibration.importers import load_rig
 from calibration.judge import judge
 from calibration.triangulate import TriangulateOptions, triangulate
+from tests.support.needs import need_data
 
 
 def nearest_frame(timecodes: Path, time_us: int) -> int:
@@ -33,9 +34,7 @@ def frame(video: Path, number: int) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_studio_with_27_cameras(data):
-    folder = data / "basketball"
-    if not folder.is_dir():
-        pytest.skip("no basketball capture among the recorded ones")
+    folder = need_data(data / "basketball")
     videos = sorted((folder / "videos").iterdir())
     time_us = int((folder / "timecodes/cam03.txt").read_text().split()[75].split("_")[1])
     pictures = {v.stem: frame(v, nearest_frame(folder / f"timecodes/{v.stem}.txt", time_us)) for v in videos}
@@ -58,9 +57,7 @@ def test_a_studio_with_27_cameras(data):
 
 @pytest.mark.slow
 def test_photographs_with_a_transforms_file(data):
-    folder = data / "fox"
-    if not folder.is_dir():
-        pytest.skip("no fox photographs among the recorded captures")
+    folder = need_data(data / "fox")
     files = sorted((folder / "images").iterdir())[10:16]
     pictures = {path.stem: cv2.imread(str(path))[..., ::-1].copy() for path in files}
     rig = load_rig(folder / "transforms.json", sorted(pictures))

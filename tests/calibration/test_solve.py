@@ -15,6 +15,7 @@ from calibration.importers import load_rig
 from calibration.rig import Rig
 from calibration.solve import Lens, SolveOptions, solve_rig
 from tests.support.calibration_scene import filmed, render
+from tests.support.needs import need_data
 
 OPTIONS = SolveOptions(features=FeatureOptions(max_features=800), lens=Lens.PINHOLE, shared_lens=True)
 
@@ -110,9 +111,7 @@ def test_pictures_must_be_alike(tmp_path):
 
 @pytest.mark.slow
 def test_photographs_of_a_fox_agree_with_their_calibration(data, tmp_path):
-    folder = data / "fox"
-    if not folder.is_dir():
-        pytest.skip("no fox photographs among the recorded captures")
+    folder = need_data(data / "fox")
     files = sorted((folder / "images").iterdir())[::3]
     pictures = {path.stem: cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_2)[..., ::-1].copy() for path in files}
     rig = solve_rig(pictures, replace(OPTIONS, features=FeatureOptions(max_features=2048), lens=Lens.OPENCV), tmp_path)

@@ -142,6 +142,8 @@ def test_settings_name_their_file_and_their_clashes(tmp_path):
 
 def test_help_is_fast():
     start = time.monotonic()
-    subprocess.run([sys.executable, "-c", "from pipelines.cli import main; main(['--help'])"], capture_output=True)
+    code = "from pipelines.cli import main; main(['--help'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "usage: packuv" in done.stdout
     # 0.2 s on a quiet machine; a heavy import would take seconds, a busy machine takes a few times more
     assert time.monotonic() - start < 3

@@ -16,7 +16,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pytest
+
+from tests.support.needs import need
 
 
 class Browser:
@@ -95,8 +96,8 @@ class Browser:
 def running_browser(folder: Path) -> Iterator[Browser]:
     """Chromium with its profile in `folder`; skips the test where there is none."""
     program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if not program or sys.platform != "linux":
-        pytest.skip("no Chromium on the PATH")
+    need("chromium", program and sys.platform == "linux", "no Chromium on the PATH")
+    assert program
     browser = Browser(program, folder)
     try:
         yield browser

@@ -1,6 +1,5 @@
 """Recordings of real cameras; skipped where the data is not there (environment variable PACKUV_DATA)."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +10,12 @@ from sync.capture import find_capture, load_timecodes
 from sync.clock import ClockMode, ClockState
 from sync.probe import probe_video
 from sync.timecode import Timecodes, read_shared_timecodes, read_timecodes
+from tests.support.needs import needs_data
+from tests.support.places import DATA
 
-DATA = Path(os.environ.get("PACKUV_DATA", Path(__file__).parent.parent.parent / "shared" / "data"))
 BASKETBALL, BRICS, LOGS, WEBCAMS = (
     DATA / name for name in ("basketball", "timecodes/brics", "timecodes/webcams", "webcams/calibration/extrinsic")
 )
-
-
-def needs(folder: Path) -> pytest.MarkDecorator:
-    return pytest.mark.skipif(not folder.is_dir(), reason=f"{folder} is absent; set PACKUV_DATA")
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +37,7 @@ def true_steps(timecodes: dict[str, Timecodes]) -> dict[str, np.ndarray]:
     return steps
 
 
-@needs(BASKETBALL)
+@needs_data(BASKETBALL)
 @pytest.mark.parametrize("clock", list(ClockMode))
 @pytest.mark.parametrize("reference", [None, "cam14", "cam22", "cam29"])
 def test_basketball_frames_have_their_true_time_step(
@@ -65,14 +61,14 @@ def test_basketball_frames_have_their_true_time_step(
     assert sum(not np.array_equal(own, np.arange(len(own))) for own in steps.values()) > 10
 
 
-@needs(BASKETBALL)
+@needs_data(BASKETBALL)
 def test_basketball_frame_counts_equal_the_timecode_lines(basketball: dict[str, Timecodes]) -> None:
     assert len(basketball) == 27
     assert all(np.array_equal(codes.indices, np.arange(len(codes))) for codes in basketball.values())
     assert min(len(codes) for codes in basketball.values()) == 143
 
 
-@needs(BRICS)
+@needs_data(BRICS)
 def test_the_rig_of_the_paper() -> None:
     (path,) = BRICS.glob("*.txt")
     codes = read_timecodes(path)
@@ -84,7 +80,7 @@ def test_the_rig_of_the_paper() -> None:
     assert camera.period_ns == 20_009_000
 
 
-@needs(BRICS)
+@needs_data(BRICS)
 @pytest.mark.parametrize("drift_ppm", [0.0, 60.0])
 def test_free_running_copies_of_the_rig_are_told_from_triggered_ones(drift_ppm: float) -> None:
     (path,) = BRICS.glob("*.txt")
@@ -102,7 +98,7 @@ def test_free_running_copies_of_the_rig_are_told_from_triggered_ones(drift_ppm: 
     assert 0.95 < report.cameras[2].matched_share < 0.999  # mutual matches of independent cameras: 98.1 % measured
 
 
-@needs(LOGS)
+@needs_data(LOGS)
 def test_every_webcam_log_can_be_aligned() -> None:
     paths = sorted(LOGS.glob("*.csv"))
     assert len(paths) > 50
@@ -124,7 +120,7 @@ def test_every_webcam_log_can_be_aligned() -> None:
         assert np.array_equal(numbers, groups.frames[:, groups.cameras.index(groups.reference)])
 
 
-@needs(WEBCAMS)
+@needs_data(WEBCAMS)
 def test_webcam_videos_form_a_capture(tmp_path: Path) -> None:
     for folder, pattern in (("videos", "*.mp4"), ("timecodes", "timestamps.csv")):
         (tmp_path / folder).mkdir()

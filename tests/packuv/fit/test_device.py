@@ -26,6 +26,7 @@ from packuv.fit.solver import Solver
 from packuv.fit.start.bounds import Bounds
 from packuv.raster import RasterOptions, gradients, render, tile_shape
 from tests.support.dense_raster import BACKGROUND, blend, camera, ellipses, scene, sh_colour, upstream
+from tests.support.needs import needs
 
 STAND_IN = "cpu:0"
 """A torch device by a name that is not ours for the CPU, so that `render` goes gsplat's way"""
@@ -148,7 +149,7 @@ def test_without_gsplat_the_cpu_does_everything(monkeypatch):
         choose_device("cuda")
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@needs("cuda", torch.cuda.is_available(), "no CUDA device")
 def test_a_real_gpu_agrees():
     assert drawn_differently("cuda") is None
     assert labelled_differently("cuda") is None

@@ -20,6 +20,7 @@ from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera, gain_table, undistorted_camera
 from packuv.footage.reader import FrameReader, packet_seconds
 from packuv.footage.views import Views, _packed, _unpacked
+from tests.support.needs import needs_ffmpeg
 
 WIDTH, HEIGHT, COUNT = 96, 64, 40
 
@@ -59,9 +60,6 @@ def remux(source: Path, target: Path, *arguments: str) -> Path:
     command = ["ffmpeg", "-v", "error", "-y", *arguments, "-i", str(source), "-c", "copy", str(target)]
     subprocess.run(command, check=True)
     return target
-
-
-needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="the ffmpeg command writes these files")
 
 
 @settings(max_examples=15, deadline=None)

@@ -16,6 +16,7 @@ from packuv.interchange import (
     write_gaussians,
     write_ply,
 )
+from tests.support.needs import needs_data
 from tests.support.places import DATA
 from tests.support.splats import FIELDS, alpha_of, random_gaussians, rotation_error
 
@@ -247,7 +248,7 @@ def test_what_is_no_splat_file_is_refused_by_name(tmp_path):
             read_gaussians(path)
 
 
-@pytest.mark.skipif(not SPLATS.is_dir(), reason="needs trained scenes under PACKUV_DATA")
+@needs_data(SPLATS)
 @pytest.mark.parametrize(("name", "count"), [("biker", 152746), ("guitar", 90854)])
 def test_trained_scenes_are_read(tmp_path, name, count):
     scene = read_ply(SPLATS / f"{name}.compressed.ply")

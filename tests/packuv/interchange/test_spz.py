@@ -17,6 +17,7 @@ from packuv.gaussians.floats import Gaussians, rotation_matrices, rows_of
 from packuv.interchange import read_gaussians, read_spz, write_spz
 from packuv.interchange.spz import _FLIP_SH
 from packuv.raster import RasterOptions, render
+from tests.support.needs import needs_data
 from tests.support.places import DATA
 from tests.support.splats import FIELDS, alpha_of, random_gaussians, rotation_error
 
@@ -253,7 +254,7 @@ def test_what_it_cannot_hold_is_said(tmp_path):
             read_gaussians(tmp_path / "b.spz")
 
 
-@pytest.mark.skipif(not SPLATS.is_dir(), reason="needs trained scenes under PACKUV_DATA")
+@needs_data(SPLATS)
 def test_one_scene_in_two_formats_is_one_scene():
     """biker.spz (version 4) and biker.compressed.ply were made from one training, row by row."""
     a, b = read_gaussians(SPLATS / "biker.spz"), read_gaussians(SPLATS / "biker.compressed.ply")

@@ -31,6 +31,7 @@ from packuv.motion.step import (
     optical_flow,
     options_from_json,
 )
+from tests.support.needs import need_data
 from tests.support.places import DATA
 
 WIDTH, HEIGHT, RADIUS = 320, 180, 25
@@ -301,9 +302,7 @@ def test_optical_flow_can_be_left_out(views: Views, cache: MotionCache, tmp_path
 
 
 def test_a_real_capture_has_moving_people_and_still_walls(tmp_path: Path) -> None:
-    data = DATA / "basketball"
-    if not data.exists():
-        pytest.skip(f"no real capture at {data}; set PACKUV_DATA")
+    data = need_data(DATA / "basketball")
     lenses = [LensCamera(PinholeCamera(name, 640, 360, 466, 465, 318, 187, np.eye(4))) for name in ("cam01", "cam09")]
     videos = {lens.pinhole.name: data / "videos" / f"{lens.pinhole.name}.mp4" for lens in lenses}
     views = Views(videos, np.repeat(np.arange(8, 13)[:, None], 2, axis=1), lenses)

@@ -1,5 +1,4 @@
 import json
-import shutil
 import subprocess
 from fractions import Fraction
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 
 from packuv.scene.matroska import Decoder, Encoder, Packet, Reader, Spool, VideoTrack, write_matroska
+from tests.support.needs import needs_ffmpeg
 
 TRACKS = (VideoTrack("large", 256, 128, 16), VideoTrack("small", 96, 64, 6))
 TIMES = {0: [0, 99, 1000], 1: [33, 66, 132, 700, 1033, 5000]}
@@ -15,7 +15,6 @@ ATTACHMENTS = {
     "a.json": ("application/json", b'{"a": 1}'),
     "b.bin": ("application/octet-stream", bytes(range(256)) * 9),
 }
-needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg program")
 
 
 def pictures():

@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -36,10 +35,10 @@ from packuv.scene.header import codes_digest
 from packuv.scene.lookahead import Address
 from packuv.scene.matroska import Packet, write_matroska
 from packuv.scene.sharing import KeyPlanner, stored_segments
+from tests.support.needs import needs_ffmpeg
 from tests.support.places import ROOT
 
 DOCUMENT = ROOT / "docs/scene-format.md"
-needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg program")
 
 
 def random_segment(rng, first, rows, dynamic, frames, degree):

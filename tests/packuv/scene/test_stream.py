@@ -26,6 +26,7 @@ from packuv.scene.stream import (
     key_codes,
     key_rows,
 )
+from tests.support.needs import needs_data
 from tests.support.places import DATA
 
 SPLATS = DATA / "splats"
@@ -340,7 +341,7 @@ def test_position_error_is_at_most_half_a_step():
     assert (error <= 0.5 * step * 1.001 + 2e-6).all()  # curvature of the scale; rounding to float32 at 20
 
 
-@pytest.mark.skipif(not SPLATS.is_dir(), reason="needs trained scenes under PACKUV_DATA")
+@needs_data(SPLATS)
 @pytest.mark.parametrize("name", ["biker", "guitar"])
 def test_positions_cost_a_small_share_of_a_trained_gaussians_size(name):
     scene = read_ply(SPLATS / f"{name}.compressed.ply")

@@ -26,6 +26,7 @@ from hypothesis import strategies as st
 from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
+from packuv.raster import RasterOptions, render
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.viewer import serve
 from packuv.viewer import server as viewer_server
@@ -362,8 +363,6 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.mark.slow
 @pytest.mark.parametrize("sh_degree", [0, 3])
 def test_the_page_draws_what_the_rasterizer_draws(browser: Browser, sh_degree: int) -> None:
-    from packuv.raster import RasterOptions, render
-
     source = replace(make_source(sh_degree), near=0.1)
     camera, background = source.cameras[2], (0.2, 0.4, 0.6)
     with running(source) as server:

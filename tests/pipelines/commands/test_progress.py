@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import io
 import os
 import re
@@ -11,7 +10,6 @@ import threading
 
 import pytest
 
-from pipelines.commands import words
 from pipelines.commands.progress import LINE_SECONDS, TerminalProgress
 from pipelines.events import Forecast, Journal
 from tasks.artefacts.store import Key
@@ -61,10 +59,6 @@ def terminal(monkeypatch):
 @pytest.fixture
 def clock():
     return Clock()
-
-
-def test_examples_in_docstrings():
-    assert doctest.testmod(words).failed == 0
 
 
 def test_file_gets_few_whole_lines(clock):
