@@ -58,4 +58,4 @@ def _error(
     if picture is None:
         return None
     drawn = render(gaussians, views.cameras[index], options=RasterOptions(near), arena=arena)
-    return np.clip(drawn.colour, 0, 1) - picture
+    return np.asarray(np.clip(drawn.colour, 0, 1) - picture)

@@ -203,7 +203,7 @@ class Solver:
     def _behind(self, target: np.ndarray) -> np.ndarray:
         """A colour at random behind all Gaussians, black where the target is, float32 [3, H, W]."""
         colour = self._rng.random(3).astype(np.float32)
-        return colour[:, None, None] * (target.max(axis=0) > _VOID)
+        return np.asarray(colour[:, None, None] * (target.max(axis=0) > _VOID))
 
     def _decoded(self) -> Gaussians:
         """What the renderer draws; only rows that may change are decoded again."""

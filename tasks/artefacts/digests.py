@@ -51,7 +51,8 @@ class FileDigests:
 
     def _load(self) -> dict[str, list[Any]]:
         with contextlib.suppress(OSError, ValueError):  # only a memory: without it the files are read again
-            return json.loads(self.path.read_text())
+            known: dict[str, list[Any]] = json.loads(self.path.read_text())
+            return known
         return {}
 
     def _save(self, entries: Mapping[str, list[Any]]) -> None:

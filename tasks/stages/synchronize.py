@@ -68,7 +68,8 @@ def selected(groups: FrameGroups, first: int, stop: int | None) -> range:
 
 def read_videos(groups: Path) -> dict[str, dict[str, Any]]:
     """What a sync artefact says about the video of each camera: width, height, codec, rate, frames, ..."""
-    return json.loads((groups / "videos.json").read_text())["videos"]
+    videos: dict[str, dict[str, Any]] = json.loads((groups / "videos.json").read_text())["videos"]
+    return videos
 
 
 def _probe_all(capture: Capture, progress: Progress) -> dict[str, VideoInfo]:

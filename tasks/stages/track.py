@@ -86,11 +86,13 @@ def read_keyframes(folder: Path) -> list[int]:
 
 def read_curve(folder: Path) -> list[float]:
     """M(t), pixels per instant."""
-    return _read(folder)["curve_px"]
+    curve: list[float] = _read(folder)["curve_px"]
+    return curve
 
 
 def _read(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / KEYFRAMES).read_text())
+    found: dict[str, Any] = json.loads((folder / KEYFRAMES).read_text())
+    return found
 
 
 def _shares(cache: MotionCache) -> np.ndarray:

@@ -40,10 +40,10 @@ def test_the_user_wins_over_the_capture_and_that_over_the_preset():
     ("settings", "message"),
     [
         ({"fitt": {"iterations": 1}}, r"unknown option fitt; valid here: pictures, sync, rig, points, motion"),
-        ({"fit": {"iteration": 1}}, r"unknown option fit\.iteration; valid here: iterations, key_iterations"),
+        ({"fit": {"iteration": 1}}, r"unknown option fit\.iteration; valid here: photometric, .*, iterations, "),
         ({"fit": {"density": {"caps": 1}}}, r"unknown option fit\.density\.caps; valid here: "),
         ({"fit": {"iterations": "many"}}, r"fit\.iterations must be a whole number, but is 'many'"),
-        ({"fit": 3}, r"fit must be a table of iterations, .*, but is 3"),
+        ({"fit": 3}, r"fit must be a table of photometric, .*, but is 3"),
         ({"motion": {"evidence": "guess"}}, r"motion\.evidence must be one of change, flow, but is 'guess'"),
         ({"pictures": {"max_width": "3"}}, r"pictures: max_width must be at least 16 pixels, but is 3"),
     ],

@@ -14,14 +14,14 @@ import pytest
 from tasks.artefacts.stage import Stage
 from tasks.stages import calibrate, encode, evaluate, fitting, synchronize, track
 from tests.support import golden
+from tests.support.needs import needs
 
 MODULES = (synchronize, calibrate, track, fitting, encode, evaluate)
 
 
 @pytest.mark.slow
+@needs("avx2", llvmlite.binding.get_host_cpu_features().get("avx2"), "the digests are those of AVX2 instructions")
 def test_every_stage_makes_what_its_version_stands_for():
-    if not llvmlite.binding.get_host_cpu_features().get("avx2", False):
-        pytest.skip("the recorded digests are those of AVX2 instructions, which this machine lacks")
     before = json.loads(golden.RECORD.read_text())
     found = golden.problems(before, golden.measure())
     assert not found, (
