@@ -27,6 +27,9 @@ _VOID = 16 / 255
 _ROUND = 24
 """Iterations, at least, before a frame asks how it fares: few cameras are passed over several times"""
 
+_FAINT = 1.02 * ALPHA_MIN
+"""Up to this opacity a Gaussian makes no tile active: codes round what lies so near to the least that is drawn"""
+
 _GREY = 1 / 255
 """A loss below one grey level is as good as none: what it gains does not count in full"""
 
@@ -251,10 +254,8 @@ class Solver:
 def tiled(shots: Sequence[Shot], masks: Sequence[np.ndarray | None], solver: Solver, views: Views) -> list[Shot]:
     """The same pictures, limited to the tiles that a mask or a Gaussian that may change touches."""
     by_name = {camera.name: mask for camera, mask in zip(views.cameras, masks, strict=True)}
-    moving = rows_of(
-        solver.model.gaussians, np.flatnonzero(solver.rows & (opacity(solver.model.gaussians) > ALPHA_MIN))
-    )
-    near = solver.bounds.near
+    gaussians, near = solver.model.gaussians, solver.bounds.near
+    moving = rows_of(gaussians, np.flatnonzero(solver.rows & (opacity(gaussians) > _FAINT)))
     return [
         replace(shot, tiles=active_tiles(by_name[shot.camera.name], moving, shot.camera, near=near)) for shot in shots
     ]
