@@ -1,4 +1,4 @@
-"""The pinhole camera that every renderer, flow and fit of this package shares.
+"""The pinhole camera that every renderer, motion and fit of this package shares.
 
 Axes are OpenCV's: x right, y down, z forward. The centre of the top-left pixel is (0.5, 0.5).
 """

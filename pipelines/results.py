@@ -9,12 +9,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import packuv
 from calibration.accept import RigReport
 from calibration.rig import Rig
 from packuv.scene import open_scene
@@ -61,7 +61,7 @@ def run_json(run: Run) -> dict[str, Any]:
     events = run.journal.events
     return {
         "sequence": run.name,
-        "packuv": version("packuv"),
+        "packuv": packuv.__version__,
         "command": shlex.join(sys.argv),
         "started": run.started.isoformat(timespec="seconds"),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -94,7 +94,7 @@ def collect(run: Run) -> ReportInput:
         name=run.name,
         command=shlex.join(sys.argv),
         options=run.options,
-        versions={"packuv": version("packuv"), "python": sys.version.split()[0]},
+        versions={"packuv": packuv.__version__, "python": sys.version.split()[0]},
         host=f"{socket.gethostname()}, {run.workshop.jobs.threads} threads a job, {run.plan.device}",
         finished=now.isoformat(timespec="seconds"),
         seconds=(now - run.started).total_seconds(),
@@ -142,4 +142,4 @@ def _pictures(folder: Path | None) -> Iterator[Comparison]:
 
 def _stage(store: Store, event: Event) -> StageRecord:
     memory = store.receipt(event.key).peak_memory_bytes if event.key else None
-    return StageRecord(event.label, event.outcome, event.seconds, memory, event.reason)  # type: ignore[arg-type]
+    return StageRecord(event.label, event.outcome, event.seconds, memory, event.reason)  # type: ignore[arg-type]  # StageRecord checks the outcome

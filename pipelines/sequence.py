@@ -22,4 +22,4 @@ def process_sequence(request: RunRequest, journal: Journal | None = None) -> Out
 def run_flow(request: RunRequest, journal: Journal) -> Outcome:
     """Run the flow here, with as many tasks at a time as the machine bears."""
     runner: ThreadPoolTaskRunner[Any] = ThreadPoolTaskRunner(max_workers=jobs_at_once(request))
-    return process_sequence.with_options(task_runner=runner)(request, journal)  # type: ignore[arg-type]
+    return process_sequence.with_options(task_runner=runner)(request, journal)  # type: ignore[arg-type]  # with_options forgets the types

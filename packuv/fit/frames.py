@@ -46,8 +46,8 @@ def fit_segment(
     ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
     for instant in instants[1 + len(track.frames) :]:
         masks = [motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras]
-        flows = [motion.optical_flow(motion.names.index(camera.name), instant) for camera in views.cameras]
-        track.add(_fit_frame(track.model, key, views, instant, masks, flows, options))
+        optical_flows = [motion.optical_flow(motion.names.index(camera.name), instant) for camera in views.cameras]
+        track.add(_fit_frame(track.model, key, views, instant, masks, optical_flows, options))
         track.checkpoint()
         ticks.advance()
     return track.segment(), track.figures
@@ -59,7 +59,7 @@ def _fit_frame(
     views: Views,
     instant: int,
     masks: Sequence[np.ndarray | None],
-    flows: Sequence[np.ndarray | None],
+    optical_flows: Sequence[np.ndarray | None],
     options: FrameOptions,
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Carry the model on to one instant; returns the rows that it changed, bool [N], and figures."""
@@ -71,7 +71,7 @@ def _fit_frame(
     solver = Solver(model, key.bounds, options, rng)
     solver.fix(key.quantizer)
     rows = moving_rows(model.gaussians, key.quantizer, views, masks, key.bounds, options)
-    model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, flows, masks,
+    model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, optical_flows, masks,
                                                near=key.bounds.near, options=options.lift)  # fmt: skip
     spare = opacity(model.gaussians) <= options.density.min_opacity
     model.forget_moments(np.flatnonzero(rows | spare))

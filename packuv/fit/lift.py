@@ -18,20 +18,20 @@ from packuv.camera import PinholeCamera
 class LiftOptions:
     enabled: bool = True
     rounds: int = 4
-    """Of reweighting; a camera whose flow belongs to something in front loses its say"""
+    """Of reweighting; a camera whose optical flow belongs to something in front loses its say"""
     tolerance_px: float = 2.0
-    """Disagreement between flow and step at which a camera counts half"""
+    """Disagreement between optical flow and step at which a camera counts half"""
     ridge: float = 0.3
     """Pull towards no motion, in squared pixels per squared pixel of motion: decides what no two cameras see"""
     min_views: int = 2
-    """Cameras with flow that a Gaussian needs to be moved"""
+    """Cameras with optical flow that a Gaussian needs to be moved"""
 
 
 def lift_motion(
     points: np.ndarray,  # [N, 3], world, at the previous instant
     cameras: Sequence[PinholeCamera],
-    flows: Sequence[np.ndarray | None],  # float32 [h, w, 2], full pixels, on the previous picture's grid
-    masks: Sequence[np.ndarray | None],  # bool [H, W]: flow elsewhere is noise and counts as none
+    optical_flows: Sequence[np.ndarray | None],  # float32 [h, w, 2], full pixels, on the previous picture's grid
+    masks: Sequence[np.ndarray | None],  # bool [H, W]: optical flow elsewhere is noise and counts as none
     *,
     near: float,
     options: LiftOptions,
@@ -40,8 +40,11 @@ def lift_motion(
     steps = np.zeros(points.shape, np.float64)
     if not options.enabled or not len(points):
         return steps.astype(np.float32)
-    seen = [_one_camera(points.astype(np.float64), camera, flow, mask, near)
-            for camera, flow, mask in zip(cameras, flows, masks, strict=True) if flow is not None]  # fmt: skip
+    seen = [
+        _one_camera(points.astype(np.float64), camera, optical_flow, mask, near)
+        for camera, optical_flow, mask in zip(cameras, optical_flows, masks, strict=True)
+        if optical_flow is not None
+    ]
     if not seen:
         return steps.astype(np.float32)
     jacobians, moved, valid = (np.stack(column, axis=1) for column in zip(*seen, strict=True))
@@ -55,15 +58,15 @@ def lift_motion(
 
 
 def _one_camera(
-    points: np.ndarray, camera: PinholeCamera, flow: np.ndarray, mask: np.ndarray | None, near: float
+    points: np.ndarray, camera: PinholeCamera, optical_flow: np.ndarray, mask: np.ndarray | None, near: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How pixels follow the points [N, 2, 3], how they moved [N, 2], and where this camera has a say, bool [N]."""
     pixels, depth = camera.project(points)
-    h, w = flow.shape[:2]
+    h, w = optical_flow.shape[:2]
     valid = (depth > near) & (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
     spot = np.where(valid[:, None], pixels, 0.0)
     cells = (spot * [w / camera.width, h / camera.height]).astype(np.int64)
-    moved = flow[cells[:, 1], cells[:, 0]].astype(np.float64)
+    moved = optical_flow[cells[:, 1], cells[:, 0]].astype(np.float64)
     if mask is not None:
         inside = spot.astype(np.int64)
         moved[~mask[inside[:, 1], inside[:, 0]]] = 0

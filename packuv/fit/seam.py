@@ -1,7 +1,7 @@
 """How much the border between two segments shows.
 
 What blinks in the render but not in the pictures is the change of their difference from one instant to the next: motion
-that render and truth share cancels, so no flow is needed to compensate it.
+that render and truth share cancels, so no optical flow is needed to compensate it.
 """
 
 from __future__ import annotations

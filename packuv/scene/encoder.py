@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from importlib.metadata import version
 from pathlib import Path
 
 import av
 import numpy as np
 
+import packuv
 from packuv.gaussians.codes import Codes
 from packuv.gaussians.segment import Segment
 from packuv.scene.header import DYNAMIC, KEY, SceneHeader, SceneIndex, SegmentEntry, TrackEntry, codes_digest
@@ -286,7 +286,7 @@ class _Queue:
 def _tools() -> dict[str, str]:
     codec, container = (av.library_versions[name] for name in ("libavcodec", "libavformat"))
     return {
-        "packuv": version("packuv"),
+        "packuv": packuv.__version__,
         "av": av.__version__,
         "libavcodec": ".".join(map(str, codec)),
         "libavformat": ".".join(map(str, container)),

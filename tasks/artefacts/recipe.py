@@ -133,7 +133,7 @@ def override(options: T, tree: Mapping[str, Any], *, where: str = "") -> T:
         nested = is_dataclass(now) and isinstance(value, Mapping)
         changes[name] = override(now, value, where=path) if nested else restore(hints[name], value, where=path)
     try:
-        return replace(options, **changes)  # type: ignore[type-var]
+        return replace(options, **changes)  # type: ignore[type-var]  # T is a dataclass
     except OptionError:
         raise
     except ValueError as error:

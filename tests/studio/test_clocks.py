@@ -103,7 +103,7 @@ def codes_of(times):
 )
 def test_bad_options_are_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        ClockOptions(**options)  # type: ignore[arg-type]
+        ClockOptions(**options)
 
 
 def test_clocks_that_hide_the_tick_are_refused() -> None:

@@ -49,7 +49,7 @@ def align_if_any(files: list[list[int]], **options: object) -> tuple[dict[str, T
     """Camera "0" is the reference; None if nothing matches it."""
     timecodes = {str(number): codes(times) for number, times in enumerate(files)}
     try:
-        return timecodes, align(timecodes, AlignOptions(reference="0", **options))[0]  # type: ignore[arg-type]
+        return timecodes, align(timecodes, AlignOptions(reference="0", **options))[0]
     except ValueError:
         return timecodes, None
 
@@ -256,11 +256,11 @@ def test_bad_input_says_what_must_hold(timecodes: dict, options: AlignOptions, m
 
 
 def test_options_check_themselves() -> None:
-    assert AlignOptions(clock="triggered").clock is ClockMode.TRIGGERED  # type: ignore[arg-type]
+    assert AlignOptions(clock="triggered").clock is ClockMode.TRIGGERED
     with pytest.raises(ValueError, match="0 ns or more"):
         AlignOptions(tolerance_ns=-1)
     with pytest.raises(ValueError, match="ClockMode"):
-        AlignOptions(clock="sundial")  # type: ignore[arg-type]
+        AlignOptions(clock="sundial")
 
 
 # Files

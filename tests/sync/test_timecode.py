@@ -43,7 +43,7 @@ def rig_lines(times_us: list[int], first: int = 0) -> str:
 
 
 def columns(path: Path, **options: object) -> tuple[list[int], list[int]]:
-    codes = read_timecodes(path, **options)  # type: ignore[arg-type]
+    codes = read_timecodes(path, **options)
     return codes.times_ns.tolist(), codes.indices.tolist()
 
 
@@ -374,13 +374,13 @@ def test_ticks_are_rounded_half_up(ticks: int, unit: Fraction) -> None:
     ],
 )
 def test_rates(value: object, rate: Fraction) -> None:
-    assert parse_rate(value) == rate  # type: ignore[arg-type]
+    assert parse_rate(value) == rate
 
 
 @pytest.mark.parametrize("value", [0, -1, "fast", "30/0", "nan", True])
 def test_bad_rates(value: object) -> None:
     with pytest.raises(ValueError, match="frame rate"):
-        parse_rate(value)  # type: ignore[arg-type]
+        parse_rate(value)
 
 
 # Frame numbers

@@ -201,7 +201,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "file"
     write_whole(path, b"old")
     with pytest.raises(TypeError):
-        write_whole(path, "text is no bytes")  # type: ignore[arg-type]
+        write_whole(path, "text is no bytes")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

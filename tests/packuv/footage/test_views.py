@@ -181,14 +181,14 @@ def test_views_survive_pickle_and_json(video: Path) -> None:
     for other in again:
         assert other.names == views.names
         assert np.array_equal(other.frames, views.frames)
-        assert np.array_equal(other.picture(0, 2), views.picture(0, 2))  # type: ignore[arg-type]
+        assert np.array_equal(other.picture(0, 2), views.picture(0, 2))
 
 
 def test_the_cache_keeps_within_its_bytes_and_changes_nothing(video: Path) -> None:
     frames = np.arange(COUNT)[:, None]
     small = Views({"a": video}, frames, [LensCamera(camera())], cache_bytes=3 * WIDTH * HEIGHT * 3)
     for instant in (0, 1, 2, 3, 1, 0, 9, 3):
-        assert np.array_equal(small.pixels(0, instant), numbered()[instant])  # type: ignore[arg-type]
+        assert np.array_equal(small.pixels(0, instant), numbered()[instant])
         assert small._cached_bytes == sum(p.nbytes for p in small._cache.values()) <= small._cache_bytes
 
 

@@ -220,10 +220,10 @@ def test_a_dropped_frame_makes_a_longer_step_and_no_peak(cache: MotionCache) -> 
 
 
 def test_cached_steps_equal_measured_ones(views: Views, cache: MotionCache) -> None:
-    before, after = (cv2.cvtColor(views.pixels(0, t), cv2.COLOR_RGB2GRAY) for t in (8, 9))  # type: ignore[arg-type]
+    before, after = (cv2.cvtColor(views.pixels(0, t), cv2.COLOR_RGB2GRAY) for t in (8, 9))
     step = measure_step(before, after, cache.options)
-    assert np.array_equal(cache.mask(0, 9), grown(step.mask, WIDTH, HEIGHT, cache.options.dilation_px))  # type: ignore[arg-type]
-    assert np.array_equal(cache.optical_flow(0, 9), step.optical_flow.astype(np.float16).astype(np.float32))  # type: ignore[arg-type]
+    assert np.array_equal(cache.mask(0, 9), grown(step.mask, WIDTH, HEIGHT, cache.options.dilation_px))
+    assert np.array_equal(cache.optical_flow(0, 9), step.optical_flow.astype(np.float16).astype(np.float32))
     assert cache.magnitude[9, 0] == np.float32(step.magnitude)
     assert cache.steps["share"][9, 0] == np.float32(step.mask.mean())
 
@@ -231,7 +231,7 @@ def test_cached_steps_equal_measured_ones(views: Views, cache: MotionCache) -> N
 def test_union_is_or_and_skips_missing_steps(cache: MotionCache) -> None:
     whole = cache.union(1, 4, 9)
     parts = [mask for t in range(4, 9) if (mask := cache.mask(1, t)) is not None]
-    assert np.array_equal(whole, np.logical_or.reduce(parts))  # type: ignore[arg-type]
+    assert np.array_equal(whole, np.logical_or.reduce(parts))
     assert cache.union(1, 5, 7) is None
     half = cache.mask(1, 7, size=(WIDTH // 2, HEIGHT // 2))
     assert half is not None
@@ -295,7 +295,7 @@ def test_another_recipe_is_refused(views: Views, cache: MotionCache, tmp_path: P
 def test_optical_flow_can_be_left_out(views: Views, cache: MotionCache, tmp_path: Path) -> None:
     short = Views(views.reader.videos, views.frames[:4], views.lenses)
     lean = measure_motion(short, tmp_path / "lean", MotionOptions(keep_flow=False))
-    assert np.array_equal(lean.mask(0, 3), cache.mask(0, 3))  # type: ignore[arg-type]
+    assert np.array_equal(lean.mask(0, 3), cache.mask(0, 3))
     assert not (tmp_path / "lean" / "a.flow.npy").exists()
     with pytest.raises(ValueError, match="measured without keep_flow"):
         lean.optical_flow(0, 3)

@@ -66,7 +66,7 @@ def make_sync(**changes: object) -> SyncReport:
         "cam0", FRAMES, 0, 0, 0, 0, 0, FRAMES * 33_000_000, 33_333_333, FRAMES, 1.0, clock, 9e5, 2e6, (0, 1, 9, 2, 0)
     )
     rows = [replace(row, camera=f"cam{index}") for index in range(6)]
-    rows[3] = replace(rows[3], **changes)  # type: ignore[arg-type]
+    rows[3] = replace(rows[3], **changes)
     return SyncReport("cam0", False, 33_333_333, 16_666_666, True, ClockMode.TRUSTED, FRAMES, FRAMES - 1, tuple(rows))
 
 
@@ -171,7 +171,7 @@ def test_the_page_has_every_section_and_stands_alone() -> None:
 @pytest.mark.parametrize("missing", ["sync", "rig", "check", "motion", "scores", "scene", "pictures", "stages", "all"])
 def test_a_missing_part_says_so_and_spoils_nothing(missing: str, tmp_path: Path) -> None:
     nothing = {name: None for name in ("sync", "rig", "check", "motion", "scene")}
-    nothing |= {name: () for name in ("scores", "pictures", "stages")}  # type: ignore[dict-item]
+    nothing |= {name: () for name in ("scores", "pictures", "stages")}
     report = make_report()
     report = ReportInput("empty") if missing == "all" else replace(report, **{missing: nothing[missing]})
     files = write_report(report, tmp_path / "new")
@@ -361,7 +361,7 @@ def test_unusable_pictures_are_refused(tmp_path: Path) -> None:
         (good[..., 0], ValueError, r"must be uint8 \[H, W, 3\]"),
     ]:
         with pytest.raises(error, match=message):
-            page_text(ReportInput("bad", pictures=(Comparison("cam1", 0, truth, good),)))  # type: ignore[arg-type]
+            page_text(ReportInput("bad", pictures=(Comparison("cam1", 0, truth, good),)))
 
 
 def test_first_middle_and_worst_frames_get_pictures() -> None:
@@ -490,4 +490,4 @@ def test_figures_that_do_not_belong_together_are_refused() -> None:
     with pytest.raises(ValueError, match="instants 0 to 2"):
         MotionCurve(np.zeros(3), (0, 3))
     with pytest.raises(ValueError, match="valid StageOutcome"):
-        StageRecord("fit", "nearly", 1.0)  # type: ignore[arg-type]
+        StageRecord("fit", "nearly", 1.0)
