@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,7 @@ class PointOptions:
 class ImportRig(Stage):
     """Import the calibration of the capture and judge it by the pictures: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 2
+    name, version = "rig", 3
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -77,8 +77,10 @@ class ImportRig(Stage):
         source = capture.calibration
         if source is None:
             raise FileNotFoundError(f"the calibration of {capture.folder} has gone since the run began")
-        videos = read_videos(work.path(self.take.groups)).items()
-        rig = load_rig(source, self.take.cameras).resized({name: (v["width"], v["height"]) for name, v in videos})
+        sizes = {name: (v["width"], v["height"]) for name, v in read_videos(work.path(self.take.groups)).items()}
+        kind, place = _kind(source), _place(capture)
+        # No path of this machine goes into an artefact: the same capture elsewhere gives the same bytes.
+        rig = replace(load_rig(source, self.take.cameras), source=f"{kind} in {place}").resized(sizes)
         work.progress(0, 1, "comparing the calibration with the pictures")
         judgement = judge(rig, footage.filmed(self.first), options=self.options.judge)
         if judgement.matches.verdict is Verdict.REJECTED and not self.options.trust:
@@ -88,8 +90,7 @@ class ImportRig(Stage):
                 "--set rig.trust=true"
             )
         _save_rig(judgement.rig, self.options, judgement.to_json(), work.out)
-        given = f"{_place(capture)} holds {_kind(source)}"
-        verdict = judgement.matches.reason
+        given, verdict = f"{place} holds {kind}", judgement.matches.reason
         return {"source": "import", "given": given, "reading": judgement.reading.value, "verdict": verdict}
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
@@ -220,7 +221,7 @@ def _place(capture: Capture) -> str:
     assert capture.calibration is not None
     folder = capture.calibration if capture.calibration.is_dir() else capture.calibration.parent
     inside = folder.is_relative_to(capture.folder)  # by name: it may be a link
-    return f"{folder.relative_to(capture.folder) if inside else folder}/"
+    return f"{folder.relative_to(capture.folder) if inside else folder.name}/"
 
 
 def _kind(source: Path) -> str:
