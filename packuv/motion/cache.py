@@ -121,14 +121,16 @@ def _pixels(views: Views, camera: int, instant: int) -> np.ndarray:
 
 
 def _recipe(views: Views, options: MotionOptions) -> dict[str, Any]:
-    """What a cache depends on, as JSON."""
-    spec = json.dumps(views.to_spec(), sort_keys=True)
+    """What a cache depends on, as JSON; videos by name and size, so that a capture may be moved."""
+    spec = views.to_spec()
+    paths = {name: Path(path) for name, path in spec["videos"].items()}
+    spec["videos"] = {name: [path.name, path.stat().st_size] for name, path in paths.items()}
     return {
         "format": FORMAT,
         "options": asdict(options),
         "cameras": [{"name": c.name, "width": c.width, "height": c.height} for c in views.cameras],
         "instants": len(views),
-        "views": hashlib.sha256(spec.encode()).hexdigest(),
+        "views": hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest(),
     }
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from packuv.files import save_json
 from packuv.motion import MotionCache, MotionOptions, measure_motion
 from packuv.motion.keyframes import KeyframeOptions, choose_keyframes, motion_curve, segments
-from tasks.artefacts.recipe import digest
 from tasks.artefacts.stage import Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.stages.footage import Footage, Take
@@ -25,13 +24,12 @@ MOTION, KEYFRAMES = "motion", "keyframes.json"
 class FindMotion(Stage):
     """Measure optical flow and motion masks of the fitted cameras."""
 
-    name, version = "motion", 2
+    name, version = "motion", 3
     take: Take
     options: MotionOptions
 
     def build(self, work: Work) -> Notes:
-        # The measurement knows the videos by their paths: a capture that was moved between two attempts starts afresh.
-        folder = work.scratch / digest(str(work.site.capture))[:16]
+        folder = work.scratch / MOTION
         views = Footage(self.take, work.site).open_views()
         cache = measure_motion(views, folder, self.options, workers=work.site.threads, progress=work.progress)
         folder.rename(work.out / MOTION)
