@@ -157,7 +157,7 @@ def _motion(report: ReportInput) -> Body:
         "shortest": min(lengths, default=0),
         "longest": max(lengths, default=0),
         "curve": line_chart(
-            series, title="Motion", x_label="frame", y_label="flow, px", marks=motion.keyframes, from_zero=True
+            series, title="Motion", x_label="frame", y_label="optical flow, px", marks=motion.keyframes, from_zero=True
         ),
     }
 
