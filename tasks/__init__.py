@@ -1,1 +1,1 @@
-"""The artefact store and one thin Prefect task per stage."""
+"""The artefact store, the stages, their report, and stages as Prefect tasks."""
