@@ -26,6 +26,9 @@ from packuv.progress import Progress, no_progress
 from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import peak_memory_bytes
 
+Job = Callable[[Progress], Any]
+"""Work for a process of its own: something that can be pickled, called with whom to tell; returns plain values"""
+
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -36,7 +39,7 @@ THREAD_VARIABLES = (
 RAISED_AS = (FileNotFoundError, NotADirectoryError, PermissionError, OSError, ValueError, MemoryError)
 """Kinds of exception that keep their kind on the way out of a job, the particular before the general"""
 PR_SET_PDEATHSIG = 1
-JOB = "job.pickle"
+JOB_FILE = "job.pickle"
 MARK = "PACKUV_JOB"
 """Environment variable of a job and all that it starts: the folder it works for"""
 
@@ -80,7 +83,7 @@ class Jobs:
 
     def run(
         self,
-        job: Callable[[Progress], Any],
+        job: Job,
         *,
         folder: Path,
         progress: Progress = no_progress,
@@ -96,7 +99,7 @@ class Jobs:
         """
         end_leftovers(folder)
         spec = folder / "spec.json"
-        (folder / JOB).write_bytes(pickle.dumps(job))
+        (folder / JOB_FILE).write_bytes(pickle.dumps(job))
         reader, writer = os.pipe()
         with open(reader, "rb") as messages:
             try:
@@ -152,7 +155,7 @@ class Jobs:
                     _kill(process)
             process.wait()
 
-    def _outcome(self, last: Mapping[str, Any] | None, code: int, job: Callable[..., Any], log: Path) -> Done:
+    def _outcome(self, last: Mapping[str, Any] | None, code: int, job: Job, log: Path) -> Done:
         self.check()
         if last is None:
             raise JobDiedError(
@@ -217,7 +220,7 @@ def main(argv: Sequence[str]) -> int:
     die_with_parent(spec["parent"])
     os.set_inheritable(spec["pipe"], False)
     with open(spec["pipe"], "w", buffering=1) as pipe:
-        pipe.write(json.dumps(_result(Path(argv[0]).with_name(JOB), _reporter(pipe))) + "\n")
+        pipe.write(json.dumps(_result(Path(argv[0]).with_name(JOB_FILE), _reporter(pipe))) + "\n")
     return 0
 
 

@@ -16,7 +16,7 @@ values; so a stage can be pickled, and its job can run on another machine.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -103,13 +103,9 @@ class Stage(ABC):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-Job = Callable[[Progress], Any]
-"""Work for a process of its own: something that can be pickled, called with whom to tell"""
-
-
 @dataclass(frozen=True)
 class StageJob:
-    """The job of a stage, ready to be sent to a process or another machine."""
+    """The job of a stage, see `tasks.artefacts.jobs.Job`, ready to be sent to a process or another machine."""
 
     stage: Stage
     site: Site

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
@@ -124,6 +123,8 @@ def neighbour_distance(points: np.ndarray) -> np.ndarray:
 
     O(N log N).
     """
+    from scipy.spatial import KDTree  # here, since loading it takes 0.17 s
+
     if len(points) < 4:
         return np.full(len(points), 1e-3, np.float32)
     _, near = KDTree(points).query(points, k=min(_CANDIDATES, len(points)))
