@@ -10,7 +10,6 @@ seconds are those of the fits that it needs, whichever run made them.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -25,7 +24,7 @@ from packuv.scene import open_scene
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
 from pipelines.process import Outcome, process_directly
-from pipelines.request import PRESETS, RunRequest, read_settings
+from pipelines.request import PRESETS, Preset, RunRequest, parse_range, read_settings
 
 COSTS = "costs.json"
 """Seconds that each artefact took, by its key, so that a later call still knows them"""
@@ -65,9 +64,9 @@ class AblationOptions:
     work: Path
     """Folder of the runs and their store"""
     rows: tuple[str, ...] = tuple(ROWS)
-    preset: str = "draft"
-    frames: tuple[int, int | None] = (0, None)
-    """Half-open"""
+    preset: Preset = "draft"
+    frames: str = ":"
+    """Instants A:B, half-open"""
     hold_out: tuple[str, ...] | None = None
     """None: what capture.toml says"""
     settings: tuple[str, ...] = ()
@@ -75,6 +74,7 @@ class AblationOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        parse_range(self.frames)
         if unknown := [name for name in self.rows if name not in ROWS]:
             raise ValueError(f"no row {', '.join(unknown)}; there are {', '.join(ROWS)}")
 
@@ -83,8 +83,8 @@ def run_row(name: str, options: AblationOptions, costs: dict[str, float]) -> dic
     """One run of the pipeline; PSNR and SSIM of the held-out cameras, MB per 30 frames, seconds of fitting."""
     settings = read_settings(None, [*options.settings, *ROWS[name]])
     request = RunRequest(
-        capture=str(options.capture),
-        out=str(options.work),
+        capture=str(options.capture.absolute()),
+        out=str(options.work.absolute()),
         preset=options.preset,
         settings=settings,
         frames=options.frames,
@@ -153,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--work", type=Path, help="folder of the runs (beside --out)")
     parser.add_argument("--rows", nargs="+", default=list(ROWS), metavar="ROW", help=", ".join(ROWS))
     parser.add_argument("--preset", choices=PRESETS, default=AblationOptions.preset)
-    parser.add_argument("--frames", type=_range, default=(0, None), metavar="A:B")
+    parser.add_argument("--frames", default=":", metavar="A:B")
     parser.add_argument("--hold-out", nargs="+", metavar="CAMERA")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of every row")
     parser.add_argument("--seed", type=int, default=0)
@@ -185,13 +185,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         given.out.write_text(json.dumps({**head, "rows": rows}, indent=1) + "\n")
         given.out.with_suffix(".md").write_text(table(rows) + "\n")
     print(table(rows))
-
-
-def _range(text: str) -> tuple[int, int | None]:
-    first, colon, stop = text.partition(":")
-    if not colon:
-        raise argparse.ArgumentTypeError(f"{text!r} is no range A:B")
-    return int(first or 0), int(stop) if stop else None
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ borders between segments that show."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
@@ -40,7 +40,16 @@ class Submit(Protocol):
     def __call__(self, stage: Stage, /) -> Future: ...
 
 
-Piece = tuple[Key, Future, range]
+@dataclass(frozen=True)
+class Span:
+    """The instants of a segment."""
+
+    number: int
+    """Of the segment, counted from 1; what is cut off it keeps the number"""
+    instants: range
+
+
+Piece = tuple[Key, Future, Span]
 """A keyframe, its segment and the segment's instants"""
 
 
@@ -64,6 +73,7 @@ class Chain:
         of the segment before it, which costs less and shows no border.
         """
         instants = [span.start for span in spans]
+        numbered = [Span(number, span) for number, span in enumerate(spans, start=1)]
         anchor, steps = fitting_order(count_pictures(self.workshop, self.plan, self.take.groups, instants))
         keys, segments = {anchor: self._first(instants[anchor]).result()}, {}
         last = anchor
@@ -71,11 +81,11 @@ class Chain:
             if index > start and not self.plan.side_by_side:
                 continue
             following = self._next(keys[start], (instants[start], instants[index]))
-            segments[last] = self._segment(keys[last], spans[last])
+            segments[last] = self._segment(keys[last], numbered[last])
             keys[index], last = following.result(), index
-        segments[last] = self._segment(keys[last], spans[last])
+        segments[last] = self._segment(keys[last], numbered[last])
         before: Piece | None = None
-        for index, span in enumerate(spans):
+        for index, span in enumerate(numbered):
             own = (keys[index], segments[index], span) if index in keys else None
             if before and (own is None or self._shows(before, own)):
                 own = self._continue(before, span)
@@ -84,13 +94,13 @@ class Chain:
                 before = piece
                 yield piece[0], piece[1].result()
 
-    def _promote(self, key: Key, segment: Future, span: range) -> Iterator[Piece]:
+    def _promote(self, key: Key, segment: Future, span: Span) -> Iterator[Piece]:
         """The segment, cut where the fit of a frame shows that a keyframe is missing."""
         frame = promoted(read_losses(self.workshop.path(segment.result())), self.options.keyframes)
         if frame is None:
             yield key, segment, span
             return
-        head, rest = range(span.start, span.start + frame), range(span.start + frame, span.stop)
+        head, rest = replace(span, instants=span.instants[:frame]), replace(span, instants=span.instants[frame:])
         cut = self.submit(CutSegment(segment=segment.result(), frames=frame))
         yield key, cut, head
         yield from self._promote(*self._continue((key, cut, head), rest))
@@ -98,16 +108,17 @@ class Chain:
     def _shows(self, before: Piece, piece: Piece) -> bool:
         """Whether the border between two segments flickers more than the first one does by itself."""
         limit, (key, segment, span) = self.options.keyframes.seam, before
-        if not limit or len(span) < 2:
+        if not limit or len(span.instants) < 2:
             return False
         measured = self.submit(MeasureSeam(take=self.take, key=key, segment=segment.result(), after=piece[0]))
         ratio = read_seam(self.workshop.path(measured.result()))
         return ratio is not None and ratio > limit
 
-    def _continue(self, before: Piece, span: range) -> Piece:
+    def _continue(self, before: Piece, span: Span) -> Piece:
         """A segment that goes on from the end of the one before it."""
         key, segment, earlier = before
-        again = self._next(key, (earlier.stop - 1, span.start), segment.result()).result()
+        step = (earlier.instants.stop - 1, span.instants.start)
+        again = self._next(key, step, segment.result()).result()
         return again, self._segment(again, span), span
 
     def _first(self, instant: int) -> Future:
@@ -130,6 +141,8 @@ class Chain:
             )
         )
 
-    def _segment(self, key: Key, span: range) -> Future:
-        instants, fit = (span.start, span.stop), self.options.fit.part(FrameOptions)
-        return self.submit(FitSegment(take=self.take, motion=self.motion, key=key, span=instants, options=fit))
+    def _segment(self, key: Key, span: Span) -> Future:
+        instants, fit = (span.instants.start, span.instants.stop), self.options.fit.part(FrameOptions)
+        return self.submit(
+            FitSegment(take=self.take, motion=self.motion, key=key, span=instants, options=fit, number=span.number)
+        )

@@ -23,7 +23,8 @@ from typing import Any, NoReturn
 import packuv
 from packuv.gaussians.uvsize import UvOptions
 from pipelines import plugins
-from pipelines.request import PRESETS, QUALITIES, STAGES
+from pipelines.request import PRESETS, QUALITIES, STAGES, parse_range
+from tasks.artefacts.jobs import CancelledError
 
 OK, FAILED, WRONG, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 SINGLE = {
@@ -103,6 +104,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # `packuv info SCENE | head` is no failure
         return OK
+    except CancelledError as error:
+        return _say(FAILED, error)
     except OSError as error:  # a full disk, a lost network: the system's fault, and its message says all
         return _say(FAILED, _system_message(error))
     except Exception as error:
@@ -180,6 +183,8 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _web(command("web", "pipelines.commands.exchange:web", "write a scene as static files for any web server"))
     _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
+    _status(command("status", "pipelines.commands.watch:status", "tell what runs, what failed and what is done"))
+    _cancel(command("cancel", "pipelines.commands.watch:cancel", "end runs within seconds; they can go on later"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
     command("doctor", "pipelines.commands.doctor:doctor", "tell what this machine has and lacks")
     plugins.plug_in(command, lambda problem: _say(WRONG, problem), found)
@@ -200,11 +205,12 @@ def _simulate(command: argparse.ArgumentParser) -> None:
 def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
     command.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/")
+    command.add_argument("--name", default=None, help="of the sequence (what capture.toml or the folder says)")
     command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
     command.add_argument("--quality", choices=QUALITIES, default="lossless", help="how near the file stays to the fit")
     command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what fits and renders")
     command.add_argument(
-        "--frames", type=_range, default=(0, None), metavar="A:B", help="instants A to B - 1, counted from 0 (all)"
+        "--frames", type=_range_text, default=":", metavar="A:B", help="instants A to B - 1, counted from 0 (all)"
     )
     command.add_argument(
         "--hold-out",
@@ -221,6 +227,18 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
     _seed(command)
     _set(command, "a setting of a stage; wins over --config and --preset")
     _json(command)
+
+
+def _status(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "folder", type=Path, nargs="?", default=Path("runs"), metavar="DIR", help="output folder (runs)"
+    )
+    _json(command)
+
+
+def _cancel(command: argparse.ArgumentParser) -> None:
+    command.add_argument("folder", type=Path, metavar="DIR", help="output folder, or that of one sequence")
+    command.add_argument("sequence", nargs="*", metavar="SEQUENCE", help="only these (all that run)")
 
 
 def _scene(command: argparse.ArgumentParser, *, json: bool = False) -> None:
@@ -387,11 +405,15 @@ def _size(text: str) -> tuple[int, int]:
 
 def _range(text: str) -> tuple[int, int | None]:
     """Half-open; either end may be missing."""
-    match = re.fullmatch(r"(\d*):(\d*)", text)
-    first, stop = (int(part) if part else None for part in match.groups()) if match else (None, None)
-    if not match or (stop is not None and stop <= (first or 0)):
-        raise argparse.ArgumentTypeError(f"must be A:B with A < B, as 0:30 for the first thirty, but is {text!r}")
-    return first or 0, stop
+    try:
+        return parse_range(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _range_text(text: str) -> str:
+    _range(text)
+    return text
 
 
 def _rate(text: str) -> Fraction:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -79,11 +80,14 @@ class Audience(Protocol):
     def ended(self, event: Event) -> None:
         """Also of a stage that never began, since it is skipped."""
 
+    def told(self, label: str, text: str) -> None:
+        """Something to know that is no stage."""
+
 
 class Journal:
     """A `tasks.artefacts.workshop.Listener` that remembers. Safe to call from threads."""
 
-    def __init__(self, audience: Audience | None = None, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, *audience: Audience, clock: Callable[[], float] = time.monotonic) -> None:
         self.events: list[Event] = []
         """Every stage that ended, in order"""
         self._audience = audience
@@ -91,18 +95,35 @@ class Journal:
         self._active: dict[str, Forecast] = {}
         self._lock = threading.RLock()
 
+    @contextmanager
+    def heard_by(self, audience: Audience) -> Iterator[None]:
+        """Have one more audience for a while."""
+        with self._lock:
+            self._audience += (audience,)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._audience = tuple(other for other in self._audience if other is not audience)
+
+    def told(self, label: str, text: str) -> None:
+        """Something to know that is no stage."""
+        with self._lock:
+            for audience in self._audience:
+                audience.told(label, text)
+
     def started(self, label: str) -> None:
         with self._lock:
             self._active[label] = Forecast(self._clock())
-            if self._audience:
-                self._audience.began(label, self._active[label])
+            for audience in self._audience:
+                audience.began(label, self._active[label])
 
     def moved(self, label: str, done: float, total: float, note: str = "") -> None:
         with self._lock:
             if forecast := self._active.get(label):
                 forecast.update(self._clock(), done, total, note)
-                if self._audience:
-                    self._audience.moved(label, forecast)
+                for audience in self._audience:
+                    audience.moved(label, forecast)
 
     def waiting(self, label: str) -> None:
         self.moved(label, 0, 0, "waiting for another packuv that makes the same")
@@ -129,5 +150,5 @@ class Journal:
         with self._lock:
             self._active.pop(event.label, None)
             self.events.append(event)
-            if self._audience:
-                self._audience.ended(event)
+            for audience in self._audience:
+                audience.ended(event)

@@ -15,22 +15,27 @@ from typing import Any
 from packuv.fit.device import choose_device
 from pipelines.chain import Submit
 from pipelines.events import Event, Journal
+from pipelines.folder import claim
 from pipelines.options import compose
+from pipelines.register import RUN, Place, bury, registered
 from pipelines.request import RunRequest
-from pipelines.results import Run, collect, run_json
+from pipelines.results import Ending, Run, collect, ending_of, run_json
 from pipelines.stages import Made, Sequence
-from sync.capture import Capture, find_capture
-from tasks.artefacts.jobs import Jobs
+from sync.capture import Capture, check_name, find_capture
+from tasks.artefacts.jobs import CancelledError, Jobs
 from tasks.artefacts.recipe import write_json
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
+from tasks.report.findings import Finding, findings
 from tasks.report.record import summary
 from tasks.report.write import write_report
 from tasks.stages.encode import SCENE
 from tasks.stages.plan import Plan
 
-RUN, PARTIAL = "run.json", "scene.partial.mkv"
+PARTIAL = "scene.partial.mkv"
+MOST_FINDINGS = 8
+"""That the terminal shows"""
 CORES_PER_JOB = 4
 """A fit's threads wait for each other often enough that a big machine is better used by several fits side by side"""
 
@@ -46,6 +51,8 @@ class Outcome:
     figures: Mapping[str, Any]
     """The report's summary: PSNR, SSIM, size, time; None where there is none"""
     events: tuple[Event, ...]
+    findings: tuple[Finding, ...]
+    """What in the results a person should look at"""
 
     def to_json(self) -> dict[str, Any]:
         """For `packuv run --json`."""
@@ -54,18 +61,25 @@ class Outcome:
             "scene": self.scene and str(self.scene),
             "report": str(self.report),
             "summary": dict(self.figures),
+            "findings": [finding.text for finding in self.findings],
             "stages": [event.to_json() for event in self.events],
         }
 
     def farewell(self) -> str:
         """The last lines of a run."""
-        lines = [*_quality(self.figures), f"results    {self.folder}"]
+        lines = [*_doubts(self.findings), *_quality(self.figures), f"results    {self.folder}"]
         if self.scene:
             lines.append(f"scene      {self.scene}")
         lines.append(f"report     {self.report}")
         if self.scene:
             lines.append(f"view it    {shlex.join(['packuv', 'view', str(self.scene)])}")
         return "\n".join(lines)
+
+
+def _doubts(findings: tuple[Finding, ...]) -> Iterator[str]:
+    yield from (f"look at    {finding.text}" for finding in findings[:MOST_FINDINGS])
+    if len(findings) > MOST_FINDINGS:
+        yield f"look at    {len(findings) - MOST_FINDINGS} more findings in the report"
 
 
 def _quality(figures: Mapping[str, Any]) -> Iterator[str]:
@@ -77,50 +91,78 @@ def _quality(figures: Mapping[str, Any]) -> Iterator[str]:
         yield f"size       {figures['mb_per_30_frames']:.2f} MB per 30 frames"
 
 
-Engine = Callable[[Callable[[Stage], Key]], Submit]
-"""Given who makes stages, starts them"""
+@dataclass(frozen=True)
+class Engine:
+    """Who starts the stages of a run."""
+
+    submitter: Callable[[Callable[[Stage], Key]], Submit]
+    """Given who makes stages, starts them"""
+    place: Place | None = None
+    """Where the workflow engine knows the run"""
+    crashed: Callable[[Place], None] = lambda place: None
+    """Told of an earlier run that was killed"""
+    watched: bool = False
+    """Somebody may look at pictures while the run goes on"""
 
 
 def process_directly(request: RunRequest, journal: Journal) -> Outcome:
     """Process a sequence in this process and its jobs, without the workflow engine."""
     with ThreadPoolExecutor(max_workers=jobs_at_once(request)) as pool:
-        return process(request, journal, lambda make: lambda stage: pool.submit(make, stage))
+        return process(request, journal, Engine(lambda make: lambda stage: pool.submit(make, stage)), jobs_of(request))
 
 
-def process(request: RunRequest, journal: Journal, engine: Engine) -> Outcome:
+def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -> Outcome:
     """Process a sequence by stages that the engine starts.
 
-    Raises ValueError or FileNotFoundError for bad input, OSError when the disk cannot hold the results, and what a
-    failing stage raises. Whatever ends the run, no job goes on after it.
+    Raises ValueError or FileNotFoundError for bad input, OSError when the disk cannot hold the results, CancelledError
+    when the jobs are cancelled, and what a failing stage raises. Whatever ends the run, no job goes on after it.
     """
     started = datetime.now(UTC)
-    capture = find_capture(Path(request.capture))
+    capture = find_sequence(request)
     options = compose(request.preset, capture.settings, request.settings, seed=request.seed, quality=request.quality)
     plan = plan_of(request, capture)
     options = replace(options, fit=replace(options.fit, device=plan.device))
-    folder = Path(request.out).absolute() / capture.name
-    folder.mkdir(parents=True, exist_ok=True)
-    jobs = Jobs(threads=max(1, _cores() // jobs_at_once(request)))
+    folder = Path(request.out) / capture.name
+    claim(folder, capture)
+    bury(folder, engine.crashed)
     workshop = Workshop(Store(folder / "store"), plan.capture, jobs, journal)
-    sequence = Sequence(workshop, plan, options, engine(workshop.make), Made())
+    sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), engine.watched)
     run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
-    try:
-        sequence.run(request.stop_after)
-        return _publish(run, folder)
-    except BaseException:
-        jobs.cancel()
-        _leave_finished(sequence, folder)
-        raise
-    finally:
-        write_json(folder / RUN, run_json(run))
+    ending = Ending("finished")
+    on_record = registered(
+        folder, sequence=run.name, capture=request.capture, preset=request.preset, engine=engine.place
+    )
+    with on_record as register, journal.heard_by(register):
+        try:
+            sequence.run(request.stop_after)
+            return _publish(run, folder)
+        except BaseException as error:
+            jobs.cancel()
+            ending = ending_of(error)
+            if isinstance(error, (Exception, KeyboardInterrupt)) and not isinstance(error, CancelledError):
+                _leave_finished(sequence, folder)
+            raise
+        finally:
+            write_json(folder / RUN, run_json(run, ending))
+
+
+def find_sequence(request: RunRequest) -> Capture:
+    """The capture under the name that its results get; raises ValueError or FileNotFoundError for bad input."""
+    capture = find_capture(Path(request.capture))
+    return capture if request.name is None else replace(capture, name=check_name(request.name))
 
 
 def plan_of(request: RunRequest, capture: Capture) -> Plan:
     """What the request means for this capture; raises ValueError for cameras that it lacks or a missing GPU."""
-    first, stop = request.frames
+    first, stop = request.instants
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
     device, side_by_side = choose_device(request.device), jobs_at_once(request) > 1
     return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, device, side_by_side)
+
+
+def jobs_of(request: RunRequest) -> Jobs:
+    """The jobs of a run, with the cores shared out evenly among those that run side by side."""
+    return Jobs(threads=max(1, _cores() // jobs_at_once(request)))
 
 
 def jobs_at_once(request: RunRequest) -> int:
@@ -149,7 +191,8 @@ def _publish(run: Run, folder: Path) -> Outcome:
     content = collect(run)
     report = write_report(content, folder)
     run.journal.ended("report")
-    return Outcome(folder, scene, report.page, summary(content), tuple(run.journal.events))
+    events, found = tuple(run.journal.events), findings(content)
+    return Outcome(folder, scene, report.page, summary(content), events, found)
 
 
 def place(source: Path, target: Path) -> None:

@@ -2,54 +2,88 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal, get_args
 
 from tasks.artefacts.recipe import OptionError
 
-PRESETS = ("draft", "standard", "high")
-QUALITIES = ("lossless", "high", "medium", "low")
+Preset = Literal["draft", "standard", "high"]
+Fidelity = Literal["lossless", "high", "medium", "low"]
+Device = Literal["auto", "cpu", "cuda"]
+LastStage = Literal["sync", "calibrate", "flow", "fit", "encode", "verify", "evaluate", "report"]
+PRESETS = get_args(Preset)
+QUALITIES = get_args(Fidelity)
 """How near the scene file stays to the fit, see `packuv.scene.encoder.TOLERANCES`"""
-STAGES = ("sync", "calibrate", "flow", "fit", "encode", "verify", "evaluate", "report")
+STAGES = get_args(LastStage)
 """In the order in which a run does them"""
+FORM: dict[str, Any] = {"use_attribute_docstrings": True, "extra": "forbid"}
+"""How the workflow engine makes a form of a request, and what it does with JSON: see pydantic's configuration"""
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """One sequence to process. All values are plain, so that a scheduler can hold and show them."""
+    """One sequence to process. All values are plain, so that a scheduler can hold, show and ask for them."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = FORM
 
     capture: str
-    """Capture folder"""
+    """Capture folder, an absolute path"""
     out: str
-    """Results go to <out>/<name of the sequence>/"""
-    preset: str = "standard"
-    quality: str = "lossless"
+    """Results go to OUT/<name of the sequence>/, an absolute path"""
+    name: str | None = None
+    """Of the sequence; none: what capture.toml or the folder says. Needed where two captures bear the same name"""
+    preset: Preset = "standard"
+    """Trades time for quality"""
+    quality: Fidelity = "lossless"
     """Of the scene file; the fit does not depend on it"""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Nested: stage -> option -> value; wins over the preset"""
-    frames: tuple[int, int | None] = (0, None)
-    """Half-open range of instants"""
+    """Single settings, which win over the preset: {"fit": {"iterations": 3000}}"""
+    frames: str = ":"
+    """Instants A:B, from A up to B - 1, counted from 0; either end may be missing"""
     hold_out: tuple[str, ...] | None = None
-    """Cameras never to fit; None: those that capture.toml names"""
-    stop_after: str = "report"
-    device: str = "auto"
+    """Cameras never to fit, to score on; none: those that capture.toml names"""
+    stop_after: LastStage = "report"
+    """Last stage"""
+    device: Device = "auto"
+    """What fits and renders"""
     seed: int = 0
+    """Same seed, same bytes"""
     jobs: int | None = None
-    """Fits at once; None: from the number of cores"""
+    """Segments at once; none: from the number of cores"""
 
     def __post_init__(self) -> None:
-        choices_of = {
-            "preset": PRESETS,
-            "quality": QUALITIES,
-            "stop_after": STAGES,
-            "device": ("auto", "cpu", "cuda"),
-        }
+        choices_of = {"preset": PRESETS, "quality": QUALITIES, "stop_after": STAGES, "device": get_args(Device)}
         for name, choices in choices_of.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, but is {getattr(self, name)!r}")
+        for name in ("capture", "out"):
+            if not Path(getattr(self, name)).is_absolute():
+                raise ValueError(f"{name} must be an absolute path, but is {getattr(self, name)!r}")
+        if self.jobs is not None and self.jobs < 1:
+            raise ValueError(f"jobs must be at least 1, but is {self.jobs}")
+        parse_range(self.frames)
+
+    @property
+    def instants(self) -> tuple[int, int | None]:
+        """The range of `frames`."""
+        return parse_range(self.frames)
+
+
+def parse_range(text: str) -> tuple[int, int | None]:
+    """A half-open range; either end may be missing. Raises ValueError for what is none.
+
+    >>> parse_range("30:60"), parse_range(":"), parse_range(":8")
+    ((30, 60), (0, None), (0, 8))
+    """
+    match = re.fullmatch(r"(\d{0,15}):(\d{0,15})", text)
+    first, stop = (int(part) if part else None for part in match.groups()) if match else (None, None)
+    if not match or (stop is not None and stop <= (first or 0)):
+        raise ValueError(f"must be A:B with A < B, as 0:30 for the first thirty, but is {text!r}")
+    return first or 0, stop
 
 
 def read_settings(config: Path | None, pairs: Sequence[str]) -> dict[str, Any]:

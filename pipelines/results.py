@@ -24,6 +24,7 @@ from pipelines.options import SequenceOptions
 from pipelines.request import RunRequest
 from pipelines.stages import Made
 from sync.align import SyncReport
+from tasks.artefacts.jobs import CancelledError
 from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
@@ -56,11 +57,31 @@ class Run:
         return self.workshop.path(key) if key else None
 
 
-def run_json(run: Run) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended."""
+
+    outcome: str
+    """finished, failed, cancelled or stopped"""
+    reason: str = ""
+
+
+def ending_of(error: BaseException) -> Ending:
+    """Of a run that raised this."""
+    if isinstance(error, CancelledError):
+        return Ending("cancelled", str(error))
+    if isinstance(error, Exception):
+        return Ending("failed", str(error) or type(error).__name__)
+    return Ending("stopped", str(error) or type(error).__name__)
+
+
+def run_json(run: Run, ending: Ending) -> dict[str, Any]:
     """Which artefacts with which options, what was skipped and why, and how long it took; also of a failed run."""
     events = run.journal.events
     return {
         "sequence": run.name,
+        "outcome": ending.outcome,
+        "reason": ending.reason,
         "packuv": packuv.__version__,
         "command": shlex.join(sys.argv),
         "started": run.started.isoformat(timespec="seconds"),

@@ -22,6 +22,7 @@ from tasks.stages.evaluate import Evaluate, scored_cameras
 from tasks.stages.fitting import background_of
 from tasks.stages.footage import Take
 from tasks.stages.plan import Plan
+from tasks.stages.preview import Preview
 from tasks.stages.synchronize import synchronize
 from tasks.stages.track import ChooseKeyframes, FindMotion, read_spans
 
@@ -57,6 +58,8 @@ class Sequence:
     options: SequenceOptions
     submit: Submit
     made: Made
+    watched: bool = False
+    """Somebody may look at pictures of what is fitted before all is"""
 
     def run(self, stop_after: str) -> None:
         """Have every artefact up to the stage `stop_after`, noting each in `made`.
@@ -123,8 +126,20 @@ class Sequence:
             self.workshop.listener.skipped("background", "fit.background.iteration_share is 0")
         told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
         chain = Chain(self.workshop, self.plan, options, self.submit, told, background, self.made.only("motion"))
-        for pair in chain.fit(read_spans(self.workshop.path(self.made.only("keyframes")))):
-            self.made.add(*pair)
+        previews = []
+        for number, (key, segment) in enumerate(chain.fit(self._spans()), start=1):
+            self.made.add(key, segment)
+            if self.watched:
+                previews.append(self.submit(self._preview(key, segment, number)))
+        for preview in previews:
+            self.made.add(preview.result())
+
+    def _spans(self) -> list[range]:
+        return read_spans(self.workshop.path(self.made.only("keyframes")))
+
+    def _preview(self, key: Key, segment: Key, number: int) -> Preview:
+        take = replace(self._take("points"), cameras=scored_cameras(self.plan, self.options.evaluate), stop=None)
+        return Preview(take=take, key=key, segment=segment, number=number)
 
     def _encode(self) -> None:
         self._make(self.encoded())

@@ -245,3 +245,7 @@ def _checked(path: Path, key: str, value: Any) -> Any:
 def _suggest(name: str, known: Iterable[str]) -> str:
     close = get_close_matches(name, list(known), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def check_name(name: str) -> str:
+    return name

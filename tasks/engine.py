@@ -14,6 +14,7 @@ from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State, TaskRun
 from prefect.futures import PrefectFuture
 from prefect.states import Completed
+from prefect.task_runners import TaskRunner
 from prefect.tasks import exponential_backoff
 
 from tasks.artefacts.jobs import JobDiedError
@@ -48,8 +49,8 @@ def worth_retrying(task: Task[..., Any], run: TaskRun, state: State[Any]) -> boo
     return False
 
 
-def submitter(make: Callable[[Stage], Key]) -> Callable[[Stage], PrefectFuture[Key]]:
-    """Starts stages as tasks of the current flow run, each made by `make`.
+def submitter(make: Callable[[Stage], Key], runner: TaskRunner[Any]) -> Callable[[Stage], PrefectFuture[Key]]:
+    """Starts stages as tasks of the current flow run, in this runner, each made by `make`.
 
     Always by `submit`: a direct call of a task that returns a state would hand back the state, not the key.
     """
@@ -59,7 +60,10 @@ def submitter(make: Callable[[Stage], Key]) -> Callable[[Stage], PrefectFuture[K
         kind = type(stage)
         if kind not in tasks:
             tasks[kind] = as_task(kind, make)
-        return tasks[kind].with_options(task_run_name=stage.label).submit(stage)
+        future: PrefectFuture[Key] = runner.submit(
+            tasks[kind].with_options(task_run_name=stage.label), {"stage": stage}
+        )
+        return future
 
     return submit
 

@@ -11,8 +11,8 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID
 from rich.table import Column
 from rich.text import Text
 
-from pipelines.commands.words import ending, left, percent
 from pipelines.events import Event, Forecast
+from pipelines.words import LABEL_WIDTH, ending, left, percent
 
 REDRAW_SECONDS = 0.2
 BAR_WIDTH = 24
@@ -73,6 +73,9 @@ class Bars:
         self._console.print(Text(ending(event), STYLES.get(event.outcome, "")), soft_wrap=True)
         if not self._tasks:
             self._bars.stop()
+
+    def told(self, label: str, text: str) -> None:
+        self._console.print(Text(f"{label:<{LABEL_WIDTH}} {text}"), soft_wrap=True)
 
     def close(self) -> None:
         """Take the bars away."""

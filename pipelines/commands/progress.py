@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable
 from typing import Protocol, TextIO
 
-from pipelines.commands.words import LABEL_WIDTH, ending, state
 from pipelines.events import Audience, Event, Forecast
+from pipelines.words import LABEL_WIDTH, ending, state
 
 LINE_SECONDS = 5.0
 """Least time between two lines of a stage where the output is not a terminal; more for what takes long"""
@@ -38,6 +38,9 @@ class TerminalProgress:
 
     def ended(self, event: Event) -> None:
         self._display.ended(event)
+
+    def told(self, label: str, text: str) -> None:
+        self._display.told(label, text)
 
     def close(self) -> None:
         """Leave the terminal with whole lines only."""
@@ -77,6 +80,9 @@ class Lines:
 
     def ended(self, event: Event) -> None:
         self._write(ending(event))
+
+    def told(self, label: str, text: str) -> None:
+        self._write(f"{label:<{LABEL_WIDTH}} {text}")
 
     def close(self) -> None: ...
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,8 +33,9 @@ def command(arguments: argparse.Namespace) -> int:
 def request_from(arguments: argparse.Namespace) -> RunRequest:
     """What the arguments of `packuv run`, or of a command for one stage, ask for."""
     return RunRequest(
-        capture=str(arguments.capture),
-        out=str(arguments.out),
+        capture=os.path.abspath(arguments.capture),
+        out=os.path.abspath(arguments.out),
+        name=arguments.name,
         preset=arguments.preset,
         quality=arguments.quality,
         settings=read_settings(arguments.config, arguments.set),
@@ -56,10 +58,13 @@ def run(request: RunRequest, journal: Journal, *, direct: bool) -> Outcome:
         return process_directly(request, journal)
     with workflow_server(Path(request.out)) as server:
         journal.started("workflow engine")
+        from pipelines.link import Link
         from pipelines.options import compose  # takes seconds, in which the server starts
-        from pipelines.sequence import run_flow
+        from pipelines.sequence import log_to_the_server_only, run_flow
 
         compose(request.preset, CaptureSettings(), request.settings)  # a misspelt setting need not wait for the server
         server.wait_ready()
         journal.ended("workflow engine")
-        return run_flow(request, journal)
+        journal.told("dashboard", server.dashboard)
+        log_to_the_server_only()
+        return run_flow(request, journal, Link(died=server.died))

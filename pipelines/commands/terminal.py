@@ -8,11 +8,14 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from packuv.progress import Progress
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 @contextmanager
@@ -38,3 +41,11 @@ def size_text(count: float) -> str:
             return f"{count:.3g} {unit}" if unit != "B" else f"{count:.0f} B"
         count /= 1000
     return f"{count:,.1f} GB"
+
+
+def print_table(table: Table) -> None:
+    """A table that fits a terminal; in a file or pipe, whole lines however long."""
+    from rich.console import Console
+
+    wide = None if sys.stdout.isatty() else 1000
+    Console(highlight=False, width=wide).print(table)

@@ -57,7 +57,7 @@ class JobDiedError(JobError):
 
 
 class CancelledError(RuntimeError):
-    """The jobs are being ended because somebody asked for it."""
+    """The jobs are being ended; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Jobs:
         """Threads that each job may use"""
         self._running: set[subprocess.Popen[bytes]] = set()
         self._lock = threading.Lock()
-        self._cancelled = False
+        self._cancelled = ""
 
     def run(
         self,
@@ -112,17 +112,17 @@ class Jobs:
                 process.wait()
         return self._outcome(last, process.returncode, job, folder / "job.log")
 
-    def cancel(self) -> None:
-        """End all jobs and let no new one start."""
+    def cancel(self, reason: str = "ended by the user") -> None:
+        """End all jobs and let no new one start; the first reason counts."""
         with self._lock:
-            self._cancelled = True
+            self._cancelled = self._cancelled or reason
             for process in self._running:
                 _kill(process)
 
     def check(self) -> None:
         """Raise CancelledError after `cancel`."""
         if self._cancelled:
-            raise CancelledError("ended by the user; the same command goes on from here")
+            raise CancelledError(f"{self._cancelled}; the same command goes on from here")
 
     def _start(self, spec: Path, log: Path, descriptors: Sequence[int]) -> subprocess.Popen[bytes]:
         self.check()

@@ -100,7 +100,8 @@ class Stage(ABC):
 
     @property
     def _fields(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """A field declared with `compare=False` only tells people something: it is no part of the recipe."""
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.compare}
 
 
 @dataclass(frozen=True)

@@ -279,10 +279,13 @@ def named(value: Any) -> Any:
     return value
 
 
-def try_lock(descriptor: int) -> bool:
-    """Lock an open file for this process, unless another has it; the kernel frees it when the last holder ends."""
+def try_lock(descriptor: int, *, shared: bool = False) -> bool:
+    """Lock an open file for this process, unless another has it; the kernel frees it when the last holder ends.
+
+    Who only wants to know whether it is locked takes it shared, so that two who ask at once see no lock.
+    """
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +72,7 @@ class FitFirst(Stage):
 
     @property
     def label(self) -> str:
-        return f"fit key {self.instant}"
+        return f"fit keyframe {self.instant}"
 
     def build(self, work: Work) -> Notes:
         assert self.take.rig is not None, "points lie beside the rig"
@@ -107,7 +107,7 @@ class FitNext(Stage):
 
     @property
     def label(self) -> str:
-        return f"fit key {self.step[1]}{f' after {self.step[0]}' if self.end else ''}"
+        return f"fit keyframe {self.step[1]}{f' after {self.step[0]}' if self.end else ''}"
 
     def build(self, work: Work) -> Notes:
         views, before = Footage(self.take, work.site).open_views(), KeyState.load(work.path(self.previous))
@@ -139,10 +139,12 @@ class FitSegment(Stage):
     span: tuple[int, int]
     """Instants, half-open"""
     options: FrameOptions
+    number: int = field(compare=False)
+    """Which one of the sequence, counted from 1"""
 
     @property
     def label(self) -> str:
-        return f"fit {self.span[0]}-{self.span[1] - 1}"
+        return f"fit segment {self.number} (frames {self.span[0]}-{self.span[1] - 1})"
 
     def build(self, work: Work) -> Notes:
         segment, figures = fit_segment(

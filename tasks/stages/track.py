@@ -62,7 +62,7 @@ class ChooseKeyframes(Stage):
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         for still in read_still(folder):
             why = f"nothing moves in instants {still.start} to {still.stop - 1}; each repeats the keyframe"
-            yield f"fit {still.start}-{still.stop - 1}", why
+            yield f"fit frames {still.start}-{still.stop - 1}", why
 
 
 def read_spans(folder: Path) -> list[range]:

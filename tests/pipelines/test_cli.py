@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -42,7 +43,7 @@ from pipelines.request import RunRequest, read_settings
         (["atlas", "nowhere.mkv", "--frame", "0", "-o", "a.png"], "nowhere.mkv"),
         (["web", "nowhere.mkv", "-o", "site"], "nowhere.mkv"),
         (["verify"], "one of the arguments SCENE --store is required"),
-        (["run", "nowhere", "--out", "o"], "no capture folder nowhere"),
+        (["run", "nowhere", "--out", "o"], "no capture folder"),
         (["run", "nowhere", "--out", "o", "--set", "fit.iterations"], "--set needs NAME=VALUE"),
         (["run", "nowhere", "--out", "o", "--config", "none.toml"], "no file none.toml; --config needs a TOML file"),
         (["info", "nowhere.mkv"], "nowhere.mkv"),
@@ -116,14 +117,14 @@ def test_arguments_become_a_request(tmp_path):
     words = ["fit", "capture", "--out", "runs", "--preset", "draft", "--frames", ":30", "--hold-out", "cam05, cam14"]
     words += ["--config", str(config), "--set", "fit.iterations=500", "--set", "fit.density.cap=9", "--jobs", "2"]
     assert request_from(parser().parse_args(words)) == RunRequest(
-        capture="capture",
-        out="runs",
+        capture=str(Path("capture").absolute()),
+        out=str(Path("runs").absolute()),
         preset="draft",
         settings={
             "fit": {"iterations": "500", "sh_degree": 1, "density": {"cap": "9"}},
             "keyframes": {"min_separation": 9},
         },
-        frames=(0, 30),
+        frames=":30",
         hold_out=("cam05", "cam14"),
         stop_after="fit",
         jobs=2,

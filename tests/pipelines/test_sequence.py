@@ -21,7 +21,7 @@ from packuv.scene import open_scene
 from pipelines.cli import main
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
-from pipelines.process import Outcome, process, process_directly
+from pipelines.process import Engine, Outcome, jobs_of, process, process_directly
 from pipelines.request import RunRequest
 from studio.capture import SimulateOptions, TruthKind, simulate
 from studio.clocks import ClockOptions
@@ -40,6 +40,7 @@ SETTINGS: dict[str, Any] = {
         "density": {"cap": 400},
     },
 }
+FIRST, LAST = "fit segment 1 (frames 0-2)", "fit segment 2 (frames 3-5)"
 pytestmark = pytest.mark.slow
 
 
@@ -139,7 +140,7 @@ def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
 
     shorter = {**SETTINGS["fit"], "frame_iterations": 3}
     found = made(run(request(capture, out, settings={**SETTINGS, "fit": shorter}))[0])
-    assert {label for label in found if label.startswith("fit")} == {"fit 0-2", "fit key 3 after 2", "fit 3-5"}
+    assert {label for label in found if label.startswith("fit")} == {FIRST, "fit keyframe 3 after 2", LAST}
     assert {label for label in found if not label.startswith("fit")} == {"encode", "verify", "evaluate"}
     assert redone(encode={"tolerance": {"position": 10}}) == {"encode", "verify", "evaluate"}
     assert redone(evaluate={"fitted_cameras": 2}) == set()  # a camera is held out, so none of those is scored
@@ -162,10 +163,10 @@ def test_side_by_side_a_border_that_shows_is_fitted_again_from_the_frame_before_
         return {label for label in made(found) if label.startswith("fit")}, found
 
     fits, apart = fitted(0)
-    assert fits == {"fit key 3", "fit 3-5"}  # what comes first is the same, one at a time or side by side
+    assert fits == {"fit keyframe 3", LAST}  # what comes first is the same, one at a time or side by side
     fits, mended = fitted(1.01)
     assert fits == set()  # what goes on from the frame before is what one at a time makes
-    assert artefacts(mended)["fit 3-5"] == artefacts(outcome)["fit 3-5"] != artefacts(apart)["fit 3-5"]
+    assert artefacts(mended)[LAST] == artefacts(outcome)[LAST] != artefacts(apart)[LAST]
     assert seam_of(mended) < seam_of(apart)
 
 
@@ -193,23 +194,26 @@ def test_flow_shows_what_was_skipped(workflow, first, capture):
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.sorting import TaskRunSort
 
+    from pipelines.link import Link
     from pipelines.sequence import run_flow
 
     outcome, _ = first
     for part in (outcome.folder / "store" / "evaluate").iterdir():
         for file in part.rglob("*.json"):
             file.unlink()
-    again = run_flow(request(capture, outcome.folder.parent), Journal(TerminalProgress(io.StringIO())))
-    assert artefacts(again) == artefacts(outcome)
-    assert made(again) == {"evaluate"}
+    again = run_flow(request(capture, outcome.folder.parent), Journal(), Link())
+    assert artefacts(again).items() >= artefacts(outcome).items()
+    assert made(again) == {"evaluate", "preview of segment 1", "preview of segment 2"}
     with get_client(sync_client=True) as client:
         runs = client.read_task_runs(sort=TaskRunSort.EXPECTED_START_TIME_DESC, limit=len(artefacts(again)))
-    states = {item.name.rsplit("-", 1)[0]: item.state_name for item in runs}
+    states = {item.name: item.state_name for item in runs}
     assert states["evaluate"] == "Completed"
-    assert {state for stage, state in states.items() if stage != "evaluate"} == {"Skipped"}
+    assert {state for name, state in states.items() if name not in made(again)} == {"Skipped"}
+    assert {FIRST, LAST} <= set(states)
 
 
 def test_bad_input_in_a_stage_is_named_and_not_retried(workflow, capture, tmp_path):
+    from pipelines.link import Link
     from pipelines.sequence import run_flow
 
     broken = tmp_path / "broken"
@@ -218,7 +222,7 @@ def test_bad_input_in_a_stage_is_named_and_not_retried(workflow, capture, tmp_pa
         (broken / "videos" / path.name).write_bytes(path.read_bytes()[: 400 if path.stem == "cam02" else None])
     progress = Journal(TerminalProgress(io.StringIO()))
     with pytest.raises(ValueError, match=r"cam02\.mp4"):
-        run_flow(request(broken, tmp_path / "out"), progress)
+        run_flow(request(broken, tmp_path / "out"), progress, Link())
     assert [(event.label, event.outcome) for event in progress.events] == [("sync", "failed")]
     record = json.loads((tmp_path / "out" / "broken" / "run.json").read_text())
     assert record["stages"][-1]["outcome"] == "failed"
@@ -281,10 +285,10 @@ def test_a_run_that_stops_leaves_the_finished_segments_as_a_scene_that_plays(fir
             return engine
 
         with pytest.raises(KeyboardInterrupt):
-            process(asked, Journal(TerminalProgress(io.StringIO())), stop_at("FitSegment", 1))
+            process(asked, Journal(), Engine(stop_at("FitSegment", 1)), jobs_of(asked))
         assert not partial.exists()
         with pytest.raises(KeyboardInterrupt):
-            process(asked, Journal(TerminalProgress(io.StringIO())), stop_at("Encode", 1))
+            process(asked, Journal(), Engine(stop_at("Encode", 1)), jobs_of(asked))
     with open_scene(partial) as scene:
         assert len(scene) == FRAMES
     whole, _ = run(asked)

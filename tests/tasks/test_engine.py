@@ -43,6 +43,7 @@ def test_only_what_may_pass_is_retried(error, retried):
 @pytest.mark.slow
 def test_flow_skips_retries_and_gives_up(workflow, tmp_path, monkeypatch):
     from prefect import flow
+    from prefect.task_runners import ThreadPoolTaskRunner
 
     from tasks import engine
 
@@ -76,8 +77,9 @@ def test_flow_skips_retries_and_gives_up(workflow, tmp_path, monkeypatch):
     @flow(persist_result=False)
     def run(call: str, failures: int, error: Exception):
         failing[call] = failures, error
-        future = engine.submitter(make)(Flaky(call=call))
-        future.wait()
+        with ThreadPoolTaskRunner(max_workers=1) as runner:
+            future = engine.submitter(make, runner)(Flaky(call=call))
+            future.wait()
         return future.state.name, future.state.result(raise_on_failure=False)
 
     hiccup = OSError(5, "input/output error")

@@ -74,11 +74,11 @@ def test_file_gets_few_whole_lines(clock):
     shown.skipped("COLMAP", "calibration/ holds a COLMAP model")
     lines = stream.getvalue().splitlines()
     assert len(lines) == 50 / LINE_SECONDS + 3  # LINE_SHARE comes into play after 100 seconds
-    assert lines[0] == "fit segment 1     10 %, 45.0 s left, 31.2 dB"
+    assert lines[0] == "fit segment 1                   10 %, 45.0 s left, 31.2 dB"
     assert lines[-3:] == [
-        "fit segment 1    50.0 s",
-        "sync             there already",
-        "COLMAP           skipped: calibration/ holds a COLMAP model",
+        "fit segment 1                  50.0 s",
+        "sync                           there already",
+        "COLMAP                         skipped: calibration/ holds a COLMAP model",
     ]
     assert [(event.label, event.outcome) for event in shown.events] == [
         ("fit segment 1", "made"),
@@ -101,12 +101,12 @@ def test_bars_stand_below_the_lines_of_what_ended(clock, terminal):
         journal.moved("fit segment 1", step, 100, "31.2 dB [red]")
     journal.skipped("COLMAP", "calibration/ holds a [COLMAP] model")
     first, *bars = terminal.screen(100)
-    assert first == "COLMAP           skipped: calibration/ holds a [COLMAP] model"
+    assert first == "COLMAP                         skipped: calibration/ holds a [COLMAP] model"
     assert re.fullmatch(r"fit segment 1 ━{7}[╸╺]━{16}  30 % 35\.0 s left 31\.2 dB \[red\]", bars[0])
     assert bars[1].startswith("key 2         ━")
     journal.finished("key 2", Key("fit", "00"), 50.0)
     journal.failed("fit segment 1", OSError("disk full"))
-    lines = [first, "key 2            50.0 s", "fit segment 1    failed", ""]
+    lines = [first, "key 2                          50.0 s", "fit segment 1                  failed", ""]
     assert terminal.screen(100) == lines
     journal.started("again")
     assert len(terminal.screen(100)) == len(lines)
@@ -207,9 +207,9 @@ def test_who_wants_no_drawing_gets_the_lines_of_a_file(clock, terminal, monkeypa
     journal.failed("key 1", OSError("disk full"))
     shown.close()
     assert stream.getvalue() == (
-        "key 1             45 %, 5.5 s left, 31.2 dB\n"
-        "key 1             95 %, 0.5 s left, 31.2 dB\n"
-        "key 1            failed\n"
+        "key 1                           45 %, 5.5 s left, 31.2 dB\n"
+        "key 1                           95 %, 0.5 s left, 31.2 dB\n"
+        "key 1                          failed\n"
     )
 
 

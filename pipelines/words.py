@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipelines.events import Event, Forecast
 
-LABEL_WIDTH = 16
+LABEL_WIDTH = 30
 
 
 def ending(event: Event) -> str:
