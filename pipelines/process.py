@@ -21,6 +21,7 @@ from pipelines.results import Run, collect, run_json
 from pipelines.stages import Made, Sequence
 from sync.capture import Capture, find_capture
 from tasks.artefacts.jobs import Jobs
+from tasks.artefacts.originals import Originals
 from tasks.artefacts.recipe import write_json
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key, Store
@@ -94,14 +95,15 @@ def process(request: RunRequest, journal: Journal, engine: Engine) -> Outcome:
     failing stage raises. Whatever ends the run, no job goes on after it.
     """
     started = datetime.now(UTC)
-    capture = find_capture(Path(request.capture))
+    capture = find_capture(Path(request.capture).absolute())
     options = compose(request.preset, capture.settings, request.settings, seed=request.seed, quality=request.quality)
     plan = plan_of(request, capture)
     options = replace(options, fit=replace(options.fit, device=plan.device))
     folder = Path(request.out).absolute() / capture.name
     folder.mkdir(parents=True, exist_ok=True)
     jobs = Jobs(threads=max(1, _cores() // jobs_at_once(request)))
-    workshop = Workshop(Store(folder / "store"), plan.capture, jobs, journal)
+    originals = Originals(capture, folder / "file_digests.json")
+    workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
     sequence = Sequence(workshop, plan, options, engine(workshop.make), Made())
     run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
     try:
@@ -120,7 +122,7 @@ def plan_of(request: RunRequest, capture: Capture) -> Plan:
     first, stop = request.frames
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
     device, side_by_side = choose_device(request.device), jobs_at_once(request) > 1
-    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, device, side_by_side)
+    return Plan(capture.folder, capture.videos, tuple(held_out), first, stop, device, side_by_side)
 
 
 def jobs_at_once(request: RunRequest) -> int:

@@ -27,8 +27,10 @@ from tasks.artefacts.digests import file_digest
 from tasks.artefacts.recipe import write_json
 
 RECEIPT = "receipt.json"
-WORK = ".work"
-BUILT = "built.json"
+WORK, OUT = ".work", "out"
+BUILT, BEGUN = "built.json", "begun.json"
+ATTEMPTS = 2
+"""Times that a build is tried whose raw files moved under it"""
 LOCK_POLL_SECONDS = 0.2
 
 
@@ -98,6 +100,10 @@ class Damage:
 Build = Callable[[Building], Mapping[str, Any] | None]
 """Fills `building.out`; returns notes for the receipt, where `peak_memory_bytes` and `cpu` have places of their own"""
 
+Originals = Callable[[], Mapping[str, Any]]
+"""What a build reads beside artefacts: by name, something that moves when it does. Raises ValueError if one is not what
+the recipe says"""
+
 
 class Store:
     """Artefacts under one folder; any number of threads and processes may use it at once.
@@ -150,19 +156,24 @@ class Store:
         inputs: Mapping[str, Any],
         build: Build,
         *,
+        originals: Originals = dict,
         waiting: Callable[[], None] = lambda: None,
     ) -> Key:
         """Return the artefact of this recipe; call `build` if it is not there.
 
         Of several callers with the same recipe one builds and the others wait, calling `waiting` five times a second
         (it may raise to give up). A build that raises publishes nothing and keeps its scratch folder.
+
+        `originals` are looked at before a build and before its result is published. If they moved in between, nobody
+        knows what was read: all is thrown away and built once more; ValueError if they move again. Scratch that was
+        begun with others is thrown away, too.
         """
         what = _recipe(stage, version, options, inputs)
         key = Key(stage, recipe.digest(what))
         if not self.holds(key):
             with self._locked(key, waiting) as lock:
                 if not self.holds(key):
-                    self._build(key, what, build, lock)
+                    self._build(key, what, build, originals, lock)
                     return key
         self._forget(key)
         return Key(stage, key.digest, reused=True)
@@ -193,35 +204,34 @@ class Store:
                 time.sleep(LOCK_POLL_SECONDS)
             yield file.fileno()
 
-    def _build(self, key: Key, what: Mapping[str, Any], build: Build, lock: int) -> None:
+    def _build(self, key: Key, what: Mapping[str, Any], build: Build, originals: Originals, lock: int) -> None:
         place = self.work_folder(key)
-        out, built = place / "out", place / BUILT
-        if not built.exists():  # else killed after the work, while its files were read for the receipt
-            shutil.rmtree(out, ignore_errors=True)
-            out.mkdir(parents=True)
-            (place / "scratch").mkdir(exist_ok=True)
-            start = time.monotonic()
-            notes = dict(build(Building(out, place / "scratch", lock)) or {})
-            facts = {
-                "seconds": round(time.monotonic() - start, 3),
-                "peak_memory_bytes": int(notes.pop("peak_memory_bytes", 0) or peak_memory_bytes()),
-                "cpu": notes.pop("cpu", ""),
-                "notes": notes,
-            }
-            _flush_all(out)
-            write_json(built, facts)
+        for _ in range(ATTEMPTS):
+            begun, failure = _begin(place, originals), None
+            try:
+                _attempt(place, build, lock)
+            except Exception as error:  # perhaps because of what was in a raw file's place for a while
+                failure = error
+            moved = _moved(begun, originals)
+            if not moved:
+                if failure:
+                    raise failure
+                return self._publish(key, what)
+        raise ValueError(
+            f"{', '.join(moved)} moved twice while {key.stage!r} read the capture (written to, replaced or touched); "
+            "let nothing change the capture during a run, and run the same command again"
+        ) from failure
+
+    def _publish(self, key: Key, what: Mapping[str, Any]) -> None:
+        out = self.work_folder(key) / OUT
         receipt = Receipt(
             recipe=what,
             outputs=_outputs(out),
             host=socket.gethostname(),
             versions=_versions(),
             finished=datetime.now(UTC).isoformat(timespec="seconds"),
-            **json.loads(built.read_text()),
+            **json.loads((self.work_folder(key) / BUILT).read_text()),
         )
-        self._publish(key, out, receipt)
-        self._forget(key)
-
-    def _publish(self, key: Key, out: Path, receipt: Receipt) -> None:
         (out / RECEIPT).write_text(json.dumps(recipe.plain(receipt), indent=1))
         _flush(out / RECEIPT)
         _flush(out)
@@ -231,6 +241,7 @@ class Store:
         shutil.rmtree(target, ignore_errors=True)
         os.rename(out, target)
         _flush(target.parent)
+        self._forget(key)
 
     def _forget(self, key: Key) -> None:
         """Remove what is left of the building; the lock file stays, since others may wait on it."""
@@ -245,6 +256,49 @@ class Store:
                 yield Damage(key, name, "is missing")
             elif file_digest(folder / name) != item["sha256"]:
                 yield Damage(key, name, "differs from what the stage wrote")
+
+
+def _begin(place: Path, originals: Originals) -> dict[str, Any]:
+    """Have a folder to build in; what is there goes if it was begun when the raw files were others."""
+    begun: dict[str, Any] = recipe.plain(originals())
+    if _read(place / BEGUN) != begun:
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        write_json(place / BEGUN, begun)
+    return begun
+
+
+def _attempt(place: Path, build: Build, lock: int) -> None:
+    """Do the work, unless it was done and the run killed while its files were read for the receipt."""
+    out, scratch = place / OUT, place / "scratch"
+    if (place / BUILT).exists():
+        return
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    scratch.mkdir(exist_ok=True)
+    start = time.monotonic()
+    notes = dict(build(Building(out, scratch, lock)) or {})
+    facts = {
+        "seconds": round(time.monotonic() - start, 3),
+        "peak_memory_bytes": int(notes.pop("peak_memory_bytes", 0) or peak_memory_bytes()),
+        "cpu": notes.pop("cpu", ""),
+        "notes": notes,
+    }
+    _flush_all(out)
+    write_json(place / BUILT, facts)
+
+
+def _moved(begun: Mapping[str, Any], originals: Originals) -> list[str]:
+    """Names of the raw files that were touched since."""
+    now: dict[str, Any] = recipe.plain(originals())
+    return sorted(name for name in begun.keys() | now.keys() if begun.get(name) != now.get(name))
+
+
+def _read(path: Path) -> Any:
+    """What a JSON file holds; None if it is missing, or was cut short when the power went."""
+    with contextlib.suppress(OSError, ValueError):
+        return json.loads(path.read_text())
+    return None
 
 
 def peak_memory_bytes() -> int:
