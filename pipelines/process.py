@@ -23,6 +23,7 @@ from sync.capture import Capture, find_capture
 from tasks.artefacts.jobs import Jobs
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.recipe import write_json
+from tasks.artefacts.retention import RUN
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
@@ -31,7 +32,7 @@ from tasks.report.write import write_report
 from tasks.stages.encode import SCENE
 from tasks.stages.plan import Plan
 
-RUN, PARTIAL = "run.json", "scene.partial.mkv"
+PARTIAL = "scene.partial.mkv"
 CORES_PER_JOB = 4
 """A fit's threads wait for each other often enough that a big machine is better used by several fits side by side"""
 
@@ -106,15 +107,16 @@ def process(request: RunRequest, journal: Journal, engine: Engine) -> Outcome:
     workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
     sequence = Sequence(workshop, plan, options, engine(workshop.make), Made())
     run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
-    try:
-        sequence.run(request.stop_after)
-        return _publish(run, folder)
-    except BaseException:
-        jobs.cancel()
-        _leave_finished(sequence, folder)
-        raise
-    finally:
-        write_json(folder / RUN, run_json(run))
+    with workshop.store.in_use():
+        try:
+            sequence.run(request.stop_after)
+            return _publish(run, folder)
+        except BaseException:
+            jobs.cancel()
+            _leave_finished(sequence, folder)
+            raise
+        finally:
+            write_json(folder / RUN, run_json(run))
 
 
 def plan_of(request: RunRequest, capture: Capture) -> Plan:

@@ -12,6 +12,7 @@ import fcntl
 import json
 import os
 import platform
+import re
 import shutil
 import socket
 import time
@@ -20,7 +21,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from tasks.artefacts import recipe
 from tasks.artefacts.digests import file_digest
@@ -29,6 +30,7 @@ from tasks.artefacts.recipe import write_json
 RECEIPT = "receipt.json"
 WORK, OUT = ".work", "out"
 BUILT, BEGUN = "built.json", "begun.json"
+IN_USE, GONE = "in_use.lock", "gone-"
 ATTEMPTS = 2
 """Times that a build is tried whose raw files moved under it"""
 LOCK_POLL_SECONDS = 0.2
@@ -176,6 +178,8 @@ class Store:
                     self._build(key, what, build, originals, lock)
                     return key
         self._forget(key)
+        with contextlib.suppress(OSError):  # only for who cleans up: the receipt's time tells the last use
+            os.utime(self._folder(key) / RECEIPT)
         return Key(stage, key.digest, reused=True)
 
     def keys(self) -> Iterator[Key]:
@@ -187,6 +191,39 @@ class Store:
         """Compare every file of every artefact with its receipt; cost: reading them all."""
         return [damage for key in self.keys() for damage in self._audit(key)]
 
+    def absent(self) -> set[str]:
+        """Names of artefacts that others were made from and that are not here any more, as after `packuv clean`."""
+        present = {str(key) for key in self.keys()}
+        return {name for key in self.keys() for name in _names(self.receipt(key).recipe["inputs"])} - present
+
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Keep everybody from cleaning up here while the block runs; waits for who does so now."""
+        with self._open_lock(IN_USE) as file:
+            fcntl.flock(file.fileno(), fcntl.LOCK_SH)
+            yield
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[bool]:
+        """Keep runs from beginning here while the block runs; False if one is going on."""
+        with self._open_lock(IN_USE) as file:
+            yield try_lock(file.fileno())
+
+    def withdraw(self, folder: Path) -> Path | None:
+        """Take an artefact, or what is left of its building, away in one step; for those who are `alone` here.
+
+        Returns where it is now, to be removed at leisure; None if somebody builds it.
+        """
+        name = folder.name if folder.parent.name == WORK else f"{folder.parent.name}-{folder.name}"
+        if name.startswith(GONE):
+            return folder
+        with self._open_lock(f"{name}.lock") as file:
+            if not try_lock(file.fileno()):
+                return None
+            gone = self.root / WORK / f"{GONE}{name}-{time.time_ns()}"
+            os.rename(folder, gone)
+            return gone
+
     def work_folder(self, key: Key) -> Path:
         """Folder where this artefact is built; it holds the log of a failed attempt."""
         return self.root / WORK / f"{key.stage}-{key.digest}"
@@ -196,13 +233,17 @@ class Store:
 
     @contextlib.contextmanager
     def _locked(self, key: Key, waiting: Callable[[], None]) -> Iterator[int]:
-        path = self.root / WORK / f"{key.stage}-{key.digest}.lock"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "ab") as file:  # close-on-exec by default: children do not prolong the lock by accident
+        with self._open_lock(f"{key.stage}-{key.digest}.lock") as file:
             while not try_lock(file.fileno()):
                 waiting()
                 time.sleep(LOCK_POLL_SECONDS)
             yield file.fileno()
+
+    def _open_lock(self, name: str) -> BinaryIO:
+        """Close-on-exec by default: children do not prolong a lock by accident."""
+        path = self.root / WORK / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return open(path, "ab")
 
     def _build(self, key: Key, what: Mapping[str, Any], build: Build, originals: Originals, lock: int) -> None:
         place = self.work_folder(key)
@@ -331,6 +372,26 @@ def named(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: named(getattr(value, field.name)) for field in fields(value)}
     return value
+
+
+def _names(inputs: Any) -> Iterator[str]:
+    """Artefacts in the inputs of a recipe, at any depth."""
+    match inputs:
+        case str() if re.fullmatch(r"\w+/[0-9a-f]{64}", inputs):
+            yield inputs
+        case dict() | list():
+            for item in inputs.values() if isinstance(inputs, dict) else inputs:
+                yield from _names(item)
+
+
+def find_stores(folder: Path) -> list[Store]:
+    """The store itself, the store of a sequence, or the stores of all sequences of an output folder."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {folder}")
+    for found in ([folder] if folder.name == "store" else [], [folder / "store"], sorted(folder.glob("*/store"))):
+        if present := [Store(path) for path in found if path.is_dir()]:
+            return present
+    raise FileNotFoundError(f"{folder} holds no artefact store; name the folder that `packuv run --out` wrote")
 
 
 def try_lock(descriptor: int) -> bool:
