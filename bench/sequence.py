@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow.ipc
 
 from bench import command
-from pipelines.register import RUN
+from tasks.artefacts.retention import RUN
 
 _KEY_FIGURES = ("seconds", "iterations", "gaussians", "changed", "saturated", "guarded")
 _POINTS_IN_TIME = 11

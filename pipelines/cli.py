@@ -186,6 +186,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _status(command("status", "pipelines.commands.watch:status", "tell what runs, what failed and what is done"))
     _cancel(command("cancel", "pipelines.commands.watch:cancel", "end runs within seconds; they can go on later"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
+    _clean(command("clean", "pipelines.commands.stores:clean", "remove from stores what no run needs, or hold a quota"))
     command("doctor", "pipelines.commands.doctor:doctor", "tell what this machine has and lacks")
     plugins.plug_in(command, lambda problem: _say(WRONG, problem), found)
     return top
@@ -252,6 +253,22 @@ def _verify(command: argparse.ArgumentParser) -> None:
     what.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help="scene file: decode and compare every frame")
     what.add_argument(
         "--store", type=Path, metavar="DIR", help="folder of a run: compare every artefact with its receipt"
+    )
+    _json(command)
+
+
+def _clean(command: argparse.ArgumentParser) -> None:
+    command.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="output folder, sequence or store")
+    command.add_argument("--dry-run", action="store_true", help="only tell what would go")
+    command.add_argument(
+        "--keep-days", type=_days, default=0, metavar="N", help="keep what was used in the last N days (nothing for it)"
+    )
+    command.add_argument(
+        "--quota",
+        type=_bytes,
+        default=None,
+        metavar="SIZE",
+        help="then have intermediates of finished sequences go until each DIR holds at most this, as 200GB (no end)",
     )
     _json(command)
 
@@ -394,6 +411,19 @@ def _positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1 on, but is {text!r}")
     return number
+
+
+def _days(text: str) -> float:
+    if not re.fullmatch(r"\d+(?:\.\d+)?", text):
+        raise argparse.ArgumentTypeError(f"must be a number of days, but is {text!r}")
+    return float(text)
+
+
+def _bytes(text: str) -> int:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?(k|M|G|T)?B", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"must be a size with its unit, as 200GB or 1.5TB, but is {text!r}")
+    return int(Fraction(match[1]) * 1000 ** ("kMGT".index(match[2]) + 1 if match[2] else 0))
 
 
 def _size(text: str) -> tuple[int, int]:

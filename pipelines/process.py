@@ -17,13 +17,15 @@ from pipelines.chain import Submit
 from pipelines.events import Event, Journal
 from pipelines.folder import claim
 from pipelines.options import compose
-from pipelines.register import RUN, Place, bury, registered
+from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
 from pipelines.results import Ending, Run, collect, ending_of, run_json
 from pipelines.stages import Made, Sequence
 from sync.capture import Capture, check_name, find_capture
 from tasks.artefacts.jobs import CancelledError, Jobs
+from tasks.artefacts.originals import Originals
 from tasks.artefacts.recipe import write_json
+from tasks.artefacts.retention import RUN
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
@@ -125,14 +127,15 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     folder = Path(request.out) / capture.name
     claim(folder, capture)
     bury(folder, engine.crashed)
-    workshop = Workshop(Store(folder / "store"), plan.capture, jobs, journal)
+    originals = Originals(capture, folder / "file_digests.json")
+    workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
     sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), engine.watched)
     run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
     ending = Ending("finished")
     on_record = registered(
         folder, sequence=run.name, capture=request.capture, preset=request.preset, engine=engine.place
     )
-    with on_record as register, journal.heard_by(register):
+    with workshop.store.in_use(), on_record as register, journal.heard_by(register):
         try:
             sequence.run(request.stop_after)
             return _publish(run, folder)
@@ -157,7 +160,7 @@ def plan_of(request: RunRequest, capture: Capture) -> Plan:
     first, stop = request.instants
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
     device, side_by_side = choose_device(request.device), jobs_at_once(request) > 1
-    return Plan(capture.folder.absolute(), capture.videos, tuple(held_out), first, stop, device, side_by_side)
+    return Plan(capture.folder, capture.videos, tuple(held_out), first, stop, device, side_by_side)
 
 
 def jobs_of(request: RunRequest) -> Jobs:

@@ -18,10 +18,9 @@ from pathlib import Path
 
 from pipelines.events import Event, Forecast
 from tasks.artefacts.recipe import restore, write_json
+from tasks.artefacts.retention import RUN
 from tasks.artefacts.store import try_lock
 
-RUN = "run.json"
-"""What remains of the last run"""
 RUNNING = ".running"
 SAVE_SECONDS = 2.0
 """Least time between two notes of progress"""

@@ -18,6 +18,7 @@ from sync.timecode import Timecodes, parse_rate, read_shared_timecodes, read_tim
 
 TIMECODE_SUFFIXES = (".csv", ".txt", ".json")
 SHARED_TIMECODES = "timestamps.csv"
+SETTINGS = "capture.toml"
 SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
 SIDECAR_SUFFIXES = frozenset(
@@ -95,7 +96,7 @@ def find_capture(folder: Path) -> Capture:
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder; a capture is a folder with videos/<camera>.mp4 in it")
-    path = folder / "capture.toml"
+    path = folder / SETTINGS
     settings = CaptureSettings.read(path) if path.is_file() else CaptureSettings()
     videos = _find_videos(folder)
     _check_names(path, settings, videos)

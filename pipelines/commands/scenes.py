@@ -15,7 +15,7 @@ from pipelines.commands.frames import frames_of
 from pipelines.commands.terminal import print_facts, shown, size_text
 from pipelines.request import read_settings
 from tasks.artefacts.recipe import override
-from tasks.artefacts.store import Store
+from tasks.artefacts.store import find_stores
 
 if TYPE_CHECKING:
     from packuv.camera import PinholeCamera
@@ -106,28 +106,22 @@ def _verify_scene(arguments: argparse.Namespace) -> int:
 
 
 def _verify_store(arguments: argparse.Namespace) -> int:
-    stores = [Store(path) for path in _stores(arguments.store)]
+    stores = find_stores(arguments.store)
     count = sum(len(list(store.keys())) for store in stores)
     damage = [(store, found) for store in stores for found in store.verify()]
+    absent = sum(len(store.absent()) for store in stores)
     facts = {
         "artefacts": count,
+        "absent": absent,
         "damage": [{"artefact": str(d.key), "path": d.path, "reason": d.reason} for _, d in damage],
         "ok": not damage,
     }
     lines = [f"{found}; delete {store.root / str(found.key)} and run again" for store, found in damage]
+    if absent:
+        lines.append(f"{absent} artefacts that others were made from are gone; a run makes again what it needs")
     lines.append(f"{count} artefacts in {len(stores)} stores, {len(damage) or 'no'} damaged files")
     print_facts(facts, arguments.json, lambda _: "\n".join(lines))
     return 1 if damage else 0
-
-
-def _stores(folder: Path) -> list[Path]:
-    """The store itself, the store of a sequence, or the stores of all sequences of an output folder."""
-    if not folder.is_dir():
-        raise FileNotFoundError(f"no folder {folder}")
-    for found in ([folder] if folder.name == "store" else [], [folder / "store"], sorted(folder.glob("*/store"))):
-        if present := [path for path in found if path.is_dir()]:
-            return present
-    raise FileNotFoundError(f"{folder} holds no artefact store; name the folder that `packuv run --out` wrote")
 
 
 def render(arguments: argparse.Namespace) -> int:

@@ -23,8 +23,9 @@ from typing import Any
 from rich.table import Table
 
 from pipelines.commands.terminal import print_facts, print_table
-from pipelines.register import RUN, Found, Place, bury, find_runs
+from pipelines.register import Found, Place, bury, find_runs
 from pipelines.words import duration
+from tasks.artefacts.retention import RUN
 
 ENDING_SECONDS = 25.0
 """For a cancelled run to end by itself; then its process is killed"""

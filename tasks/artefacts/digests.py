@@ -13,11 +13,16 @@ from typing import Any
 from tasks.artefacts.recipe import write_json
 
 SETTLED_SECONDS = 2.0
-"""A file changed this recently is not remembered: a second change could leave size and time as they are"""
+"""A file changed this recently is not remembered: a second change could leave size and times as they are"""
+
+Signature = list[int]
+"""Size, time of modification and of change of state in nanoseconds, inode. Whoever writes to a file can set the first
+time back, but not the second one"""
+UNKNOWN: Signature = [-1, -1, -1, -1]
 
 
 class FileDigests:
-    """SHA-256 of files, remembered by size, modification time and inode, as git's index does."""
+    """SHA-256 of files, remembered by size, times and inode, as git's index does."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -41,13 +46,13 @@ class FileDigests:
     def _entry(self, path: Path, known: Mapping[str, list[Any]]) -> list[Any]:
         if not path.is_file():
             raise FileNotFoundError(f"no file {path}")
-        signature = _signature(path)
+        seen = signature(path)
         entry = known.get(str(path.resolve()))
-        if entry and entry[:-1] == signature:
+        if entry and entry[:-1] == seen:
             return entry
         sha256 = file_digest(path)
-        settled = time.time_ns() - signature[1] > SETTLED_SECONDS * 1e9 and _signature(path) == signature
-        return [*(signature if settled else [-1, -1, -1]), sha256]
+        settled = time.time_ns() - seen[2] > SETTLED_SECONDS * 1e9 and signature(path) == seen
+        return [*(seen if settled else UNKNOWN), sha256]
 
     def _load(self) -> dict[str, list[Any]]:
         with contextlib.suppress(OSError, ValueError):  # only a memory: without it the files are read again
@@ -60,9 +65,10 @@ class FileDigests:
         write_json(self.path, entries)
 
 
-def _signature(path: Path) -> list[int]:
+def signature(path: Path) -> Signature:
+    """By which a change of a file shows; raises FileNotFoundError without it."""
     stat = path.stat()
-    return [stat.st_size, stat.st_mtime_ns, stat.st_ino]
+    return [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
 
 
 def file_digest(path: Path) -> str:

@@ -12,6 +12,7 @@ import fcntl
 import json
 import os
 import platform
+import re
 import shutil
 import socket
 import time
@@ -20,15 +21,18 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from tasks.artefacts import recipe
 from tasks.artefacts.digests import file_digest
 from tasks.artefacts.recipe import write_json
 
 RECEIPT = "receipt.json"
-WORK = ".work"
-BUILT = "built.json"
+WORK, OUT = ".work", "out"
+BUILT, BEGUN = "built.json", "begun.json"
+IN_USE, GONE = "in_use.lock", "gone-"
+ATTEMPTS = 2
+"""Times that a build is tried whose raw files moved under it"""
 LOCK_POLL_SECONDS = 0.2
 
 
@@ -98,6 +102,10 @@ class Damage:
 Build = Callable[[Building], Mapping[str, Any] | None]
 """Fills `building.out`; returns notes for the receipt, where `peak_memory_bytes` and `cpu` have places of their own"""
 
+Originals = Callable[[], Mapping[str, Any]]
+"""What a build reads beside artefacts: by name, something that moves when it does. Raises ValueError if one is not what
+the recipe says"""
+
 
 class Store:
     """Artefacts under one folder; any number of threads and processes may use it at once.
@@ -150,21 +158,28 @@ class Store:
         inputs: Mapping[str, Any],
         build: Build,
         *,
+        originals: Originals = dict,
         waiting: Callable[[], None] = lambda: None,
     ) -> Key:
         """Return the artefact of this recipe; call `build` if it is not there.
 
         Of several callers with the same recipe one builds and the others wait, calling `waiting` five times a second
         (it may raise to give up). A build that raises publishes nothing and keeps its scratch folder.
+
+        `originals` are looked at before a build and before its result is published. If they moved in between, nobody
+        knows what was read: all is thrown away and built once more; ValueError if they move again. Scratch that was
+        begun with others is thrown away, too.
         """
         what = _recipe(stage, version, options, inputs)
         key = Key(stage, recipe.digest(what))
         if not self.holds(key):
             with self._locked(key, waiting) as lock:
                 if not self.holds(key):
-                    self._build(key, what, build, lock)
+                    self._build(key, what, build, originals, lock)
                     return key
         self._forget(key)
+        with contextlib.suppress(OSError):  # only for who cleans up: the receipt's time tells the last use
+            os.utime(self._folder(key) / RECEIPT)
         return Key(stage, key.digest, reused=True)
 
     def keys(self) -> Iterator[Key]:
@@ -176,6 +191,39 @@ class Store:
         """Compare every file of every artefact with its receipt; cost: reading them all."""
         return [damage for key in self.keys() for damage in self._audit(key)]
 
+    def absent(self) -> set[str]:
+        """Names of artefacts that others were made from and that are not here any more, as after `packuv clean`."""
+        present = {str(key) for key in self.keys()}
+        return {name for key in self.keys() for name in _names(self.receipt(key).recipe["inputs"])} - present
+
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Keep everybody from cleaning up here while the block runs; waits for who does so now."""
+        with self._open_lock(IN_USE) as file:
+            fcntl.flock(file.fileno(), fcntl.LOCK_SH)
+            yield
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[bool]:
+        """Keep runs from beginning here while the block runs; False if one is going on."""
+        with self._open_lock(IN_USE) as file:
+            yield try_lock(file.fileno())
+
+    def withdraw(self, folder: Path) -> Path | None:
+        """Take an artefact, or what is left of its building, away in one step; for those who are `alone` here.
+
+        Returns where it is now, to be removed at leisure; None if somebody builds it.
+        """
+        name = folder.name if folder.parent.name == WORK else f"{folder.parent.name}-{folder.name}"
+        if name.startswith(GONE):
+            return folder
+        with self._open_lock(f"{name}.lock") as file:
+            if not try_lock(file.fileno()):
+                return None
+            gone = self.root / WORK / f"{GONE}{name}-{time.time_ns()}"
+            os.rename(folder, gone)
+            return gone
+
     def work_folder(self, key: Key) -> Path:
         """Folder where this artefact is built; it holds the log of a failed attempt."""
         return self.root / WORK / f"{key.stage}-{key.digest}"
@@ -185,43 +233,46 @@ class Store:
 
     @contextlib.contextmanager
     def _locked(self, key: Key, waiting: Callable[[], None]) -> Iterator[int]:
-        path = self.root / WORK / f"{key.stage}-{key.digest}.lock"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "ab") as file:  # close-on-exec by default: children do not prolong the lock by accident
+        with self._open_lock(f"{key.stage}-{key.digest}.lock") as file:
             while not try_lock(file.fileno()):
                 waiting()
                 time.sleep(LOCK_POLL_SECONDS)
             yield file.fileno()
 
-    def _build(self, key: Key, what: Mapping[str, Any], build: Build, lock: int) -> None:
+    def _open_lock(self, name: str) -> BinaryIO:
+        """Close-on-exec by default: children do not prolong a lock by accident."""
+        path = self.root / WORK / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return open(path, "ab")
+
+    def _build(self, key: Key, what: Mapping[str, Any], build: Build, originals: Originals, lock: int) -> None:
         place = self.work_folder(key)
-        out, built = place / "out", place / BUILT
-        if not built.exists():  # else killed after the work, while its files were read for the receipt
-            shutil.rmtree(out, ignore_errors=True)
-            out.mkdir(parents=True)
-            (place / "scratch").mkdir(exist_ok=True)
-            start = time.monotonic()
-            notes = dict(build(Building(out, place / "scratch", lock)) or {})
-            facts = {
-                "seconds": round(time.monotonic() - start, 3),
-                "peak_memory_bytes": int(notes.pop("peak_memory_bytes", 0) or peak_memory_bytes()),
-                "cpu": notes.pop("cpu", ""),
-                "notes": notes,
-            }
-            _flush_all(out)
-            write_json(built, facts)
+        for _ in range(ATTEMPTS):
+            begun, failure = _begin(place, originals), None
+            try:
+                _attempt(place, build, lock)
+            except Exception as error:  # perhaps because of what was in a raw file's place for a while
+                failure = error
+            moved = _moved(begun, originals)
+            if not moved:
+                if failure:
+                    raise failure
+                return self._publish(key, what)
+        raise ValueError(
+            f"{', '.join(moved)} moved twice while {key.stage!r} read the capture (written to, replaced or touched); "
+            "let nothing change the capture during a run, and run the same command again"
+        ) from failure
+
+    def _publish(self, key: Key, what: Mapping[str, Any]) -> None:
+        out = self.work_folder(key) / OUT
         receipt = Receipt(
             recipe=what,
             outputs=_outputs(out),
             host=socket.gethostname(),
             versions=_versions(),
             finished=datetime.now(UTC).isoformat(timespec="seconds"),
-            **json.loads(built.read_text()),
+            **json.loads((self.work_folder(key) / BUILT).read_text()),
         )
-        self._publish(key, out, receipt)
-        self._forget(key)
-
-    def _publish(self, key: Key, out: Path, receipt: Receipt) -> None:
         (out / RECEIPT).write_text(json.dumps(recipe.plain(receipt), indent=1))
         _flush(out / RECEIPT)
         _flush(out)
@@ -231,6 +282,7 @@ class Store:
         shutil.rmtree(target, ignore_errors=True)
         os.rename(out, target)
         _flush(target.parent)
+        self._forget(key)
 
     def _forget(self, key: Key) -> None:
         """Remove what is left of the building; the lock file stays, since others may wait on it."""
@@ -245,6 +297,49 @@ class Store:
                 yield Damage(key, name, "is missing")
             elif file_digest(folder / name) != item["sha256"]:
                 yield Damage(key, name, "differs from what the stage wrote")
+
+
+def _begin(place: Path, originals: Originals) -> dict[str, Any]:
+    """Have a folder to build in; what is there goes if it was begun when the raw files were others."""
+    begun: dict[str, Any] = recipe.plain(originals())
+    if _read(place / BEGUN) != begun:
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        write_json(place / BEGUN, begun)
+    return begun
+
+
+def _attempt(place: Path, build: Build, lock: int) -> None:
+    """Do the work, unless it was done and the run killed while its files were read for the receipt."""
+    out, scratch = place / OUT, place / "scratch"
+    if (place / BUILT).exists():
+        return
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    scratch.mkdir(exist_ok=True)
+    start = time.monotonic()
+    notes = dict(build(Building(out, scratch, lock)) or {})
+    facts = {
+        "seconds": round(time.monotonic() - start, 3),
+        "peak_memory_bytes": int(notes.pop("peak_memory_bytes", 0) or peak_memory_bytes()),
+        "cpu": notes.pop("cpu", ""),
+        "notes": notes,
+    }
+    _flush_all(out)
+    write_json(place / BUILT, facts)
+
+
+def _moved(begun: Mapping[str, Any], originals: Originals) -> list[str]:
+    """Names of the raw files that were touched since."""
+    now: dict[str, Any] = recipe.plain(originals())
+    return sorted(name for name in begun.keys() | now.keys() if begun.get(name) != now.get(name))
+
+
+def _read(path: Path) -> Any:
+    """What a JSON file holds; None if it is missing, or was cut short when the power went."""
+    with contextlib.suppress(OSError, ValueError):
+        return json.loads(path.read_text())
+    return None
 
 
 def peak_memory_bytes() -> int:
@@ -277,6 +372,26 @@ def named(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: named(getattr(value, field.name)) for field in fields(value)}
     return value
+
+
+def _names(inputs: Any) -> Iterator[str]:
+    """Artefacts in the inputs of a recipe, at any depth."""
+    match inputs:
+        case str() if re.fullmatch(r"\w+/[0-9a-f]{64}", inputs):
+            yield inputs
+        case dict() | list():
+            for item in inputs.values() if isinstance(inputs, dict) else inputs:
+                yield from _names(item)
+
+
+def find_stores(folder: Path) -> list[Store]:
+    """The store itself, the store of a sequence, or the stores of all sequences of an output folder."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {folder}")
+    for found in ([folder] if folder.name == "store" else [], [folder / "store"], sorted(folder.glob("*/store"))):
+        if present := [Store(path) for path in found if path.is_dir()]:
+            return present
+    raise FileNotFoundError(f"{folder} holds no artefact store; name the folder that `packuv run --out` wrote")
 
 
 def try_lock(descriptor: int, *, shared: bool = False) -> bool:

@@ -9,8 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from tasks.artefacts.digests import FileDigests
+from sync.capture import Capture
 from tasks.artefacts.jobs import Jobs
+from tasks.artefacts.originals import Originals
 from tasks.artefacts.stage import Files, Notes, Site, Stage, StageJob
 from tasks.artefacts.store import Building, Key, Store
 
@@ -38,35 +39,43 @@ class Workshop:
     """Where the stages of one sequence are made."""
 
     store: Store
-    capture: Path
-    """Capture folder"""
+    originals: Originals
+    """The capture"""
     jobs: Jobs
     listener: Listener
 
     @property
+    def capture(self) -> Capture:
+        """As it was when the run began."""
+        return self.originals.capture
+
+    @property
     def site(self) -> Site:
         """What jobs are told of it."""
-        return Site(self.store.root, self.capture, self.jobs.threads)
+        return Site(self.store.root, self.capture.folder, self.jobs.threads)
 
     def files(self, paths: Mapping[str, Path], label: str) -> Files:
-        """Raw files by name, with their digests, which are remembered beside the store.
+        """Raw files by name, with their digests; no stage is made any more once one of them is another.
 
         Raises FileNotFoundError that names a missing file.
         """
-        remembered = FileDigests(self.store.root.parent / "file_digests.json")
-        return Files(remembered(paths, progress=partial(self.listener.moved, label)))
+        return Files(self.originals.digests(paths, partial(self.listener.moved, label)))
 
     def make(self, stage: Stage) -> Key:
         """The artefact of a stage, by its job if it is not there.
 
-        What the job returns becomes the notes of the receipt. Raises what `Jobs.run` raises.
+        What the job returns becomes the notes of the receipt. Raises what `Jobs.run` raises, and ValueError when a raw
+        file is not what it was.
         """
         start = time.monotonic()
         self.listener.started(stage.label)
         build = partial(self._build, stage)
         waiting = partial(self._wait, stage.label)
+        originals = self.originals.look
         try:
-            key = self.store.make(stage.name, stage.version, stage.settings, stage.sources, build, waiting=waiting)
+            key = self.store.make(
+                stage.name, stage.version, stage.settings, stage.sources, build, originals=originals, waiting=waiting
+            )
         except BaseException as error:
             self.listener.failed(stage.label, error)
             raise

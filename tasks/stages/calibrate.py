@@ -75,8 +75,8 @@ class ImportRig(Stage):
     def build(self, work: Work) -> Notes:
         capture, footage = find_capture(work.site.capture), Footage(self.take, work.site)
         source = capture.calibration
-        if source is None:
-            raise FileNotFoundError(f"the calibration of {capture.folder} has gone since the run began")
+        if source is None or _files(source).keys() != self.files.sha256.keys():
+            raise FileNotFoundError(f"the calibration of {capture.folder} is another one than when the run began")
         sizes = {name: (v["width"], v["height"]) for name, v in read_videos(work.path(self.take.groups)).items()}
         kind, place = _kind(source), _place(capture)
         # No path of this machine goes into an artefact: the same capture elsewhere gives the same bytes.
@@ -129,7 +129,7 @@ class SolveRig(Stage):
 def find_rig(workshop: Workshop, plan: Plan, groups: Key, options: RigOptions) -> ImportRig | SolveRig:
     """The stage for a capture with a calibration, or for one without."""
     take = Take(groups=groups, cameras=tuple(plan.videos))
-    source = find_capture(plan.capture).calibration
+    source = workshop.capture.calibration
     if source is None:
         return SolveRig(take=take, first=plan.first, options=options)
     files = workshop.files(_files(source), "reading calibration")

@@ -33,6 +33,7 @@ class Synchronize(Stage):
 
     def build(self, work: Work) -> Notes:
         found = find_capture(work.site.capture)
+        self._check(found)
         infos = _probe_all(found, work.progress)
         timecodes = load_timecodes(found, infos)
         groups, report = align(timecodes, self.options)
@@ -43,10 +44,19 @@ class Synchronize(Stage):
         write_json(work.out / "videos.json", {"rate": rate, "videos": videos})
         return {"instants": len(groups), "cameras": len(groups.cameras), "reference": groups.reference}
 
+    def _check(self, found: Capture) -> None:
+        """A file that comes and goes while the job runs is seen by nobody else."""
+        videos, timecodes, settings = list(found.videos), list(found.timecodes), found.settings
+        if (videos, timecodes) != (list(self.videos.sha256), list(self.timecodes.sha256)) or (
+            settings.fps,
+            settings.timecode_column,
+        ) != (self.fps, self.timecode_column):
+            raise ValueError(f"files or settings of {found.folder} changed while they were read; run the command again")
+
 
 def synchronize(workshop: Workshop, options: AlignOptions) -> Synchronize:
     """The stage for a workshop's capture; cost: reading the files that changed since the last time."""
-    capture = find_capture(workshop.capture)
+    capture = workshop.capture
     return Synchronize(
         videos=workshop.files(capture.videos, "reading videos"),
         timecodes=workshop.files(capture.timecodes, "reading timecodes"),

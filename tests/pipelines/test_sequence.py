@@ -229,6 +229,64 @@ def test_bad_input_in_a_stage_is_named_and_not_retried(workflow, capture, tmp_pa
     assert "cam02.mp4" in record["stages"][-1]["reason"]
 
 
+def test_a_video_that_is_another_one_for_a_while_leaves_nothing_wrong_behind(first, capture, tmp_path):
+    outcome, _ = first
+    copy = shutil.copytree(capture, tmp_path / "copy")
+    video, seen = copy / "videos/cam01.mp4", []
+    asked = request(copy, tmp_path)
+
+    def stage_after(stage: str, replace_with: Path):
+        """An engine under which the video becomes another one as soon as a stage is made."""
+
+        def engine(make):
+            def submit(asked):
+                seen.append(type(asked).__name__)
+                future = pool.submit(make, asked)
+                if seen[-1] == stage:
+                    future.result()
+                    with Store(tmp_path / "tiny/store").alone() as alone:
+                        assert not alone  # nobody cleans up between two stages
+                    shutil.copyfile(replace_with, copy / "part")
+                    os.replace(copy / "part", video)
+                return future
+
+            return submit
+
+        return engine
+
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        with pytest.raises(ValueError, match=r"cam01\.mp4 has another content than when this run began; put back"):
+            process(asked, Journal(), stage_after("ChooseKeyframes", capture / "videos/cam02.mp4"))
+        assert seen[-1] == "FindBackground"
+        shutil.copyfile(capture / "videos/cam01.mp4", video)
+        whole = process(asked, Journal(), stage_after("", video))
+    assert made(whole).isdisjoint({"sync", "rig", "points", "motion", "keyframes"})
+    assert sha256(whole.scene) == sha256(outcome.scene)
+
+
+def test_after_a_clean_the_same_command_makes_what_is_gone_with_the_same_bytes(first, capture, tmp_path, capsys):
+    shutil.copytree(first[0].folder, tmp_path / "tiny")
+    asked = request(capture, tmp_path, settings={**SETTINGS, "encode": {"tolerance": {"position": 10}}})
+    outcome, _ = run(asked)
+    main(["clean", str(tmp_path), "--json"])
+    (folder,) = json.loads(capsys.readouterr().out)["folders"]
+    names = [item["name"].split("/")[0] for item in folder["sequences"][0]["gone"]]
+    assert {"encode", "verify", "evaluate"} <= set(names)
+    again, _ = run(asked)
+    assert made(again) == set()
+    main(["clean", str(tmp_path), "--quota", f"{folder['kept_bytes'] - 1}B", "--json"])
+    (folder,) = json.loads(capsys.readouterr().out)["folders"]
+    assert [(item["name"].split("/")[0], item["why"]) for item in folder["sequences"][0]["gone"]] == [
+        ("motion", "over quota")
+    ]
+    assert main(["verify", "--store", str(tmp_path)]) == 0
+    assert "1 artefacts that others were made from are gone" in capsys.readouterr().out
+    again, _ = run(asked)
+    assert made(again) == {"motion"}  # a run makes all of its stages, whether or not what is left to do reads them
+    assert sha256(again.scene) == sha256(outcome.scene)
+    assert main(["verify", "--store", str(tmp_path)]) == 0
+
+
 @pytest.mark.parametrize(("mode", "kills"), [("--direct", 3), ("", 1)], ids=["direct", "prefect"])
 def test_killed_runs_end_with_the_same_bytes(first, capture, tmp_path, mode, kills):
     outcome, _ = first

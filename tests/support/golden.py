@@ -99,6 +99,7 @@ def _measure_here() -> Found:
     from pipelines.stages import Made, Sequence
     from sync.capture import find_capture
     from tasks.artefacts.jobs import Jobs
+    from tasks.artefacts.originals import Originals
     from tasks.artefacts.stage import Site, Stage, Work
     from tasks.artefacts.store import Key, Store
     from tasks.artefacts.workshop import Workshop
@@ -136,7 +137,8 @@ def _measure_here() -> Found:
         plan = Plan(capture.folder, capture.videos, ("cam03",), 0, None, "cpu", True)
         options = compose("draft", capture.settings, SETTINGS)
         options = replace(options, keyframes=replace(options.keyframes, seam=100.0))
-        workshop = Workshop(store, capture.folder, Jobs(threads=1), Quiet())
+        originals = Originals(capture, Path(folder) / "file_digests.json")
+        workshop = Workshop(store, originals, Jobs(threads=1), Quiet())
         steps: list[Stage] = []
 
         def submit(stage: Stage) -> Done:

@@ -17,7 +17,9 @@ from pathlib import Path
 
 import pytest
 
+from sync.capture import find_capture
 from tasks.artefacts.jobs import CancelledError, JobDiedError, JobError, Jobs, end_leftovers
+from tasks.artefacts.originals import Originals
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
 
@@ -179,7 +181,11 @@ def test_job_dies_with_its_parent(jobs, tmp_path):
 
 def test_workshop_makes_an_artefact_by_a_job_and_tells(jobs, work, tmp_path):
     listener = Quiet()
-    workshop = Workshop(Store(tmp_path / "store"), tmp_path, jobs, listener)
+    for camera in ("cam00", "cam01"):
+        (tmp_path / "capture/videos").mkdir(parents=True, exist_ok=True)
+        (tmp_path / f"capture/videos/{camera}.mp4").touch()
+    originals = Originals(find_capture(tmp_path / "capture"), tmp_path / "file_digests.json")
+    workshop = Workshop(Store(tmp_path / "store"), originals, jobs, listener)
     stage = work.Area(size=work.Size(3))
     for _ in range(2):
         key = workshop.make(stage)

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from fractions import Fraction
@@ -334,22 +333,19 @@ def test_finished_work_is_not_done_again_after_a_kill_before_publication(tmp_pat
 # --- digests of files
 
 
-def test_digests_are_remembered_and_change_with_content(tmp_path):
+def test_digests_are_remembered_and_change_with_content(tmp_path, monkeypatch):
+    monkeypatch.setattr("tasks.artefacts.digests.SETTLED_SECONDS", 0)
     file = tmp_path / "cam00.mp4"
     file.write_bytes(b"one")
-    old = time.time_ns() - 10**10
-    os.utime(file, ns=(old, old))
     digests = FileDigests(tmp_path / "memory" / "digests.json")
-    first = digests({"cam00": file})
+    first, stat = digests({"cam00": file}), file.stat()
     assert first == {"cam00": file_digest(file)}
-    remembered = json.loads(digests.path.read_text())
-    assert digests({"cam00": file}) == first
+    digests.path.write_text(digests.path.read_text().replace(first["cam00"], "remembered"))
+    assert digests({"cam00": file}) == {"cam00": "remembered"}
     file.write_bytes(b"two")
+    os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    # Size, time of modification and inode are the same, as when a hidden change is restored: the time of change tells.
     assert digests({"cam00": file}) == {"cam00": file_digest(file)} != first
-    digests.path.write_text(json.dumps(remembered))
-    os.utime(file, ns=(old, old))
-    # Same size, time and inode: this is what "remembered" means, and why the next test's rule exists.
-    assert digests({"cam00": file}) == first
 
 
 def test_a_file_written_just_now_is_not_remembered(tmp_path):
