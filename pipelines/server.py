@@ -24,13 +24,14 @@ from tasks.artefacts.store import try_lock
 
 START_SECONDS = 300
 HOMES = 16
-"""Most runs under one output folder at a time, each with a database of its own"""
+"""Most runs under one output folder at a time, each with a server of its own"""
 
 QUIET = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
     "PREFECT_LOGGING_LEVEL": "CRITICAL",  # the run reports its failures itself, once
+    "PREFECT_LOGGING_INTERNAL_LEVEL": "CRITICAL",  # or it says that the server is gone, which the run has ended
     "PREFECT_SERVER_LOGGING_LEVEL": "WARNING",  # into the server's log file
     "PREFECT_CLI_COLORS": "false",
     # Slow machines and shared disks: wait rather than fail.
@@ -47,6 +48,7 @@ EMBEDDED = {
     "PREFECT_LOGGING_TO_API_ENABLED": "false",  # no dashboard shows them
     "PREFECT_SERVER_UI_ENABLED": "false",
     "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
+    "PREFECT_SERVER_DATABASE_CONNECTION_URL": "sqlite+aiosqlite:///:memory:",  # a full disk is no matter of the engine
     "PREFECT__SERVER_EPHEMERAL": "1",
     "PREFECT__SERVER_FINAL": "1",
 }
@@ -77,7 +79,7 @@ def workflow_server(out: Path) -> Iterator[Server]:
     """Have Prefect's settings in the environment and its server running, or starting.
 
     Enter before anything imports prefect. A server that the user names in PREFECT_API_URL is taken as it is; otherwise
-    one is started that keeps its database in PREFECT_HOME or, without that, under `out`/.prefect.
+    one is started that keeps its database in memory and its log in PREFECT_HOME or, without that, under `out`/.prefect.
     """
     with _environment(QUIET):
         if "PREFECT_API_URL" in os.environ:
@@ -103,7 +105,7 @@ def _environment(defaults: Mapping[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _home(out: Path) -> Iterator[tuple[Path, BinaryIO]]:
-    """The first folder that no other run uses: two servers on one SQLite file get in each other's way."""
+    """The first folder that no other run uses: two servers would write over each other's log."""
     if "PREFECT_HOME" in os.environ:
         homes = [Path(os.environ["PREFECT_HOME"])]
     else:
