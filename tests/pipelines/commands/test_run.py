@@ -101,6 +101,7 @@ def test_a_run_whose_output_nobody_reads_comes_to_its_end(undisturbed, tmp_path,
     code, errors = bash('"$@" > /dev/full', words(tmp_path, mode, "--json"))
     assert code == FAILED
     assert errors.endswith("packuv: cannot write to standard output: No space left on device\n")
+    assert not list(tmp_path.rglob("*.db*")), "the engine's database is in memory, so that no full disk stops it"
 
 
 @pytest.mark.slow
