@@ -29,12 +29,16 @@ from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
 from tasks.report.facts import Comparison, MotionCurve, ReportInput, SceneFigures, StageRecord, scene_figures
+from tasks.report.write import JSON_NAME, PAGE_NAME
 from tasks.stages.calibrate import CHECK
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
 from tasks.stages.footage import RIG
 from tasks.stages.plan import Plan
 from tasks.stages.track import read_curve, read_keyframes
+
+WHOLE = (SCENE, PAGE_NAME, JSON_NAME, "run.json")
+"""Files of a run that came to its end, in its folder"""
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,13 @@ def _artefact(store: Store, key: Any) -> dict[str, Any]:
         "finished": receipt.finished,
         "notes": receipt.notes,
     }
+
+
+def check_whole(folder: Path) -> None:
+    """Raise OSError if a file that a whole run leaves is not there, as where somebody removed it meanwhile."""
+    for name in WHOLE:
+        if not (folder / name).is_file():
+            raise OSError(f"the run came to its end, but {folder / name} is not there; run the same command again")
 
 
 def collect(run: Run) -> ReportInput:
