@@ -204,6 +204,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _web(command("web", "pipelines.commands.exchange:web", "write a scene as static files for any web server"))
     _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
+    _serve(command("serve", "pipelines.commands.serve:serve", "keep a dashboard, and run by form, script or schedule"))
     _status(command("status", "pipelines.commands.watch:status", "tell what runs, what failed and what is done"))
     _cancel(command("cancel", "pipelines.commands.watch:cancel", "end runs within seconds; they can go on later"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
@@ -249,6 +250,17 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
     _seed(command)
     _set(command, "a setting of a stage; wins over --config and --preset")
     _json(command)
+
+
+def _serve(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/")
+    command.add_argument("--data", type=Path, default=None, metavar="PATH", help="manifest, or folder of captures")
+    command.add_argument("--cron", default=None, metavar="EXPR", help="when to process all of it, as '0 2 * * *'")
+    command.add_argument("--timezone", default="UTC", help="that --cron means")
+    command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
+    command.add_argument("--at-once", type=_positive, default=1, metavar="N", help="runs at a time")
+    command.add_argument("--host", default="127.0.0.1", help="address of the dashboard, which has no password")
+    command.add_argument("--port", type=_positive, default=4200, help="of the dashboard")
 
 
 def _status(command: argparse.ArgumentParser) -> None:

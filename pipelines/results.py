@@ -76,7 +76,7 @@ def ending_of(error: BaseException) -> Ending:
         return Ending("cancelled", str(error))
     if isinstance(error, Exception):
         return Ending("failed", str(error) or type(error).__name__)
-    return Ending("stopped", str(error) or type(error).__name__)
+    return Ending("stopped", "Ctrl-C" if isinstance(error, KeyboardInterrupt) else "ended by a signal")
 
 
 def run_json(run: Run, ending: Ending) -> dict[str, Any]:

@@ -105,13 +105,13 @@ def workflow_server(out: Path) -> Iterator[Server]:
     taken as it is, then that of a `packuv serve` for this output folder. Else one is started that keeps its log in
     PREFECT_HOME or, without that, under `out`/.prefect, and its database in memory, for that is of no use afterwards.
     """
-    with _environment(QUIET):
-        if address := os.environ.get("PREFECT_API_URL") or _profile_address():
-            with _environment({"PREFECT_API_URL": address}):
-                yield Server(address.rstrip("/"))
+    with override(QUIET, keep=True):
+        if named := named_server():
+            with override({"PREFECT_API_URL": named.address}):
+                yield named
             return
         if served := find_served(out):
-            with _environment({"PREFECT_API_URL": served, **_results(served, out)}):
+            with override({"PREFECT_API_URL": served, **_results(served, out)}):
                 yield Server(served)
             return
         with (
@@ -140,7 +140,7 @@ def running_server(
     with socket.create_server((host, port)) as listener, open(log, "wb") as output:
         address = f"http://{host}:{listener.getsockname()[1]}/api"
         ours = {"PREFECT_HOME": str(home), "PREFECT_API_URL": address, "PREFECT_UI_API_URL": address}
-        with _environment({**settings, **_results(address, out)}), _override(ours):
+        with override({**settings, **_results(address, out)}, keep=True), override(ours):
             process = subprocess.Popen(
                 [sys.executable, "-P", "-m", __name__, str(os.getpid()), str(listener.fileno()), str(out.absolute())],
                 stdin=subprocess.DEVNULL,
@@ -155,6 +155,12 @@ def running_server(
             finally:
                 process.kill()  # nothing in its database is needed again, and its own shutdown takes seconds
                 process.wait()
+
+
+def named_server() -> Server | None:
+    """The server that the user names, in PREFECT_API_URL or in Prefect's profile."""
+    address = os.environ.get("PREFECT_API_URL") or _profile_address()
+    return Server(address.rstrip("/")) if address else None
 
 
 def results_url(path: Path) -> str:
@@ -206,15 +212,9 @@ def _profile_address() -> str | None:
 
 
 @contextlib.contextmanager
-def _environment(defaults: Mapping[str, str]) -> Iterator[None]:
-    """Set variables that are not set; undo it afterwards."""
-    with _override({name: value for name, value in defaults.items() if name not in os.environ}):
-        yield
-
-
-@contextlib.contextmanager
-def _override(values: Mapping[str, str]) -> Iterator[None]:
-    """Set variables; undo it afterwards."""
+def override(values: Mapping[str, str], *, keep: bool = False) -> Iterator[None]:
+    """Set environment variables, with `keep` only those that are not set; undo it afterwards."""
+    values = {name: value for name, value in values.items() if not keep or name not in os.environ}
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -224,6 +224,17 @@ def _override(values: Mapping[str, str]) -> Iterator[None]:
             os.environ.pop(name, None)
             if value is not None:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def own_home(out: Path, name: str) -> Iterator[tuple[Path, BinaryIO]]:
+    """The one folder of a server that stays; raises RuntimeError where it is in use."""
+    home = out.absolute() / ".prefect" / name
+    home.mkdir(parents=True, exist_ok=True)
+    with open(home / "in_use.lock", "ab") as lock:
+        if not try_lock(lock.fileno()):
+            raise RuntimeError(f"{home} is in use: a packuv serve for {out} is running already")
+        yield home, lock
 
 
 @contextlib.contextmanager
