@@ -35,6 +35,7 @@ from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
 from tasks.stages.footage import RIG
 from tasks.stages.plan import Plan
+from tasks.stages.synchronize import read_videos
 from tasks.stages.track import read_curve, read_keyframes
 
 WHOLE = (SCENE, PAGE_NAME, JSON_NAME, "run.json")
@@ -134,6 +135,8 @@ def collect(run: Run) -> ReportInput:
         rig=Rig.load(rig_folder / RIG) if rig_folder else None,
         held_out=run.plan.held_out,
         check=_check(run.folder("rig")),
+        colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
+        log_like=_log_like(run),
         motion=_curve(run.folder("keyframes")),
         scores=_scores(run.folder("evaluate")),
         scene=_scene(run),
@@ -146,6 +149,11 @@ def _check(folder: Path | None) -> RigReport | None:
     if folder is None:
         return None
     return RigReport(**json.loads((folder / CHECK).read_text()))
+
+
+def _log_like(run: Run) -> tuple[str, ...]:
+    points = run.made.get("points")
+    return tuple(run.workshop.store.receipt(points).notes["log_like"]) if points else ()
 
 
 def _curve(folder: Path | None) -> MotionCurve | None:
