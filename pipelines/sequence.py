@@ -73,6 +73,7 @@ def log_to_the_server_only() -> None:
     for handler in root.handlers[:]:
         if isinstance(handler, PrefectConsoleHandler):
             root.removeHandler(handler)
+    root.addHandler(logging.NullHandler())  # with none at all, Python would write warnings to the terminal
 
 
 def _process(request: RunRequest, journal: Journal, link: Link) -> Outcome | State[Any]:
