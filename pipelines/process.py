@@ -15,6 +15,7 @@ from typing import Any
 from packuv.fit.device import choose_device
 from pipelines.chain import Submit
 from pipelines.events import Event, Journal
+from pipelines.lender import lender_of
 from pipelines.options import compose
 from pipelines.request import RunRequest
 from pipelines.results import Run, collect, run_json
@@ -102,7 +103,8 @@ def process(request: RunRequest, journal: Journal, engine: Engine) -> Outcome:
     folder.mkdir(parents=True, exist_ok=True)
     jobs = Jobs(threads=max(1, _cores() // jobs_at_once(request)))
     workshop = Workshop(Store(folder / "store"), plan.capture, jobs, journal)
-    sequence = Sequence(workshop, plan, options, engine(workshop.make), Made())
+    lender = lender_of(request, capture, workshop, engine)
+    sequence = Sequence(workshop, plan, options, engine(workshop.make), Made(), lender)
     run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
     try:
         sequence.run(request.stop_after)
