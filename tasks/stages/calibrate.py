@@ -182,7 +182,8 @@ def find_rig(workshop: Workshop, plan: Plan, groups: Key, options: RigOptions) -
     take = Take(groups=groups, cameras=tuple(plan.videos))
     source = find_capture(plan.capture).calibration
     if source is None:
-        return SolveRig(take=take, first=plan.first, options=options)
+        # Trust is of given rigs: who trusts a lent one must not have it solved again.
+        return SolveRig(take=take, first=plan.first, options=replace(options, trust=False))
     files = workshop.files(_files(source), "reading calibration")
     return ImportRig(take=take, first=plan.first, files=files, options=options)
 

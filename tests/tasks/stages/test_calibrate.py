@@ -9,10 +9,14 @@ import pytest
 from calibration.accept import MatchesReport, Verdict
 from calibration.judge import SharedJudgement
 from calibration.moved import Standing
+from pipelines.events import Journal
+from tasks.artefacts.jobs import Jobs
 from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key, Store
-from tasks.stages.calibrate import BorrowRig, RigOptions, _lent, _moved, store_of
+from tasks.artefacts.workshop import Workshop
+from tasks.stages.calibrate import BorrowRig, RigOptions, _lent, _moved, find_rig, store_of
 from tasks.stages.footage import RIG, Take
+from tasks.stages.plan import Plan
 from tests.support.artefacts import put
 
 NAMES = ("cam01", "cam02", "cam03", "cam04")
@@ -67,3 +71,14 @@ def test_a_lent_rig_is_found_by_its_content(tmp_path):
         assert _lent(root, Files({RIG: sha256})) == store.path(key) / RIG
     with pytest.raises(FileNotFoundError, match="has lost its rig"):
         _lent(root, Files({RIG: "0" * 64}))
+
+
+def test_who_trusts_a_rig_that_was_lent_does_not_have_it_solved_again(tmp_path):
+    (tmp_path / "videos").mkdir()
+    videos = {name: tmp_path / "videos" / f"{name}.mp4" for name in NAMES}
+    for video in videos.values():
+        video.write_bytes(b"content")
+    workshop = Workshop(Store(tmp_path / "store"), tmp_path, Jobs(threads=1), Journal())
+    plan = Plan(tmp_path, videos, (), 0, None, "cpu", side_by_side=False)
+    stages = [find_rig(workshop, plan, STAGE.take.groups, RigOptions(trust=trust)) for trust in (False, True)]
+    assert stages[0] == stages[1]
