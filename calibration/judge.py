@@ -6,8 +6,8 @@ programs. The geometry alone rarely shows it: cameras on a dome still look inwar
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from calibration.accept import MatchesReport, PairMatches, Verdict, matches_report
 from calibration.features import Features, pairs_by_look
+from calibration.moved import Standing, find_moved
 from calibration.rig import Rig
 from calibration.triangulate import TriangulateOptions, choose_pairs, detect_all, verified_matches
 
@@ -72,6 +73,45 @@ def judge(rig: Rig, pictures: Mapping[str, np.ndarray], *, options: TriangulateO
             f"{rig.source}: the cameras see no common volume, and the pictures agree with no other reading"
         )
     return Judgement(rig, Reading.AS_GIVEN, given, given)
+
+
+@dataclass(frozen=True)
+class SharedJudgement:
+    """What the pictures of a take say about the rig of another one."""
+
+    standings: Mapping[str, Standing]
+    """Of the cameras of which the pictures say enough"""
+    moved: tuple[str, ...]
+    """Cameras that stand elsewhere now"""
+    matches: MatchesReport
+    """Of all cameras but the moved ones"""
+
+    def usual(self) -> float:
+        """Median share of points that fit, of the cameras that have not been moved."""
+        fitting = [standing.fitting for name, standing in self.standings.items() if name not in self.moved]
+        return float(np.median(fitting)) if fitting else 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        standings = {name: asdict(standing) for name, standing in self.standings.items()}
+        return {"moved": list(self.moved), "standings": standings, "matches": self.matches.to_json()}
+
+
+def judge_shared(
+    rig: Rig, instants: Iterable[Mapping[str, np.ndarray]], *, options: TriangulateOptions = _DEFAULTS
+) -> SharedJudgement:
+    """Compare a rig that was right in another take with synchronized pictures of this one, a mapping per instant.
+
+    Its convention is beyond doubt; cameras may have been moved. Raises ValueError for pictures that do not fit the rig.
+    """
+    pairs, evidence = choose_pairs(rig, neighbours=options.neighbours), list[PairMatches]()
+    for pictures in instants:
+        features = detect_all(rig, pictures, options=options.features)
+        near = [(first, second) for first, second in pairs if first in features and second in features]
+        evidence += verified_matches(rig, features, near, ratio=options.ratio)
+    standings, moved = find_moved(rig, evidence)
+    still = [pair for pair in evidence if not {pair.first, pair.second} & set(moved)]
+    kept = rig.select(name for name in rig.names if name not in moved)
+    return SharedJudgement(standings, moved, matches_report(kept, still, options=options.judge))
 
 
 def reread(rig: Rig, reading: Reading) -> Rig:

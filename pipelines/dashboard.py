@@ -82,7 +82,7 @@ class Dashboard:
         self._logger().log(level, "%s: %s", event.label, outcome(event))
         if event.label in self._bars and event.outcome == "made":
             self._bar(event.label, 1.0, f"done in {duration(event.seconds)}")
-        if event.key is not None and event.key.stage in SHOWN:
+        if event.key is not None and event.key.stage in SHOWN and self._store.holds(event.key):  # not a lender's
             SHOWN[event.key.stage](self, self._store.path(event.key))
 
     def told(self, label: str, text: str) -> None:

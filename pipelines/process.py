@@ -17,6 +17,7 @@ from packuv.fit.device import choose_device
 from pipelines.chain import Submit
 from pipelines.events import Event, Journal
 from pipelines.folder import claim
+from pipelines.lender import lender_of
 from pipelines.options import compose
 from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
@@ -132,7 +133,8 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     bury(folder, engine.crashed)
     originals = Originals(capture, folder / "file_digests.json")
     workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
-    sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), engine.watched)
+    lender = lender_of(request, capture, workshop, engine.submitter)
+    sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), lender, engine.watched)
     run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
     on_record = registered(
         folder, sequence=run.name, capture=request.capture, preset=request.preset, engine=engine.place

@@ -7,7 +7,7 @@ import shlex
 import socket
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from tasks.report.write import JSON_NAME, PAGE_NAME
 from tasks.stages.calibrate import CHECK
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
+from tasks.stages.fitting import REFUSED
 from tasks.stages.footage import RIG
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import read_videos
@@ -134,7 +135,7 @@ def collect(run: Run) -> ReportInput:
         sync=SyncReport.load(sync_folder) if sync_folder else None,
         rig=Rig.load(rig_folder / RIG) if rig_folder else None,
         held_out=run.plan.held_out,
-        check=_check(run.folder("rig")),
+        check=_check(run),
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
         log_like=_log_like(run),
         motion=_curve(run.folder("keyframes")),
@@ -145,10 +146,13 @@ def collect(run: Run) -> ReportInput:
     )
 
 
-def _check(folder: Path | None) -> RigReport | None:
+def _check(run: Run) -> RigReport | None:
+    folder, background = run.folder("rig"), run.made.get("background")
     if folder is None:
         return None
-    return RigReport(**json.loads((folder / CHECK).read_text()))
+    report = RigReport(**json.loads((folder / CHECK).read_text()))
+    refused = run.workshop.store.receipt(background).notes.get(REFUSED, {}) if background else {}
+    return replace(report, suspicious={**report.suspicious, **refused})
 
 
 def _log_like(run: Run) -> tuple[str, ...]:
@@ -181,5 +185,6 @@ def _pictures(folder: Path | None) -> Iterator[Comparison]:
 
 
 def _stage(store: Store, event: Event) -> StageRecord:
-    memory = store.receipt(event.key).peak_memory_bytes if event.key else None
+    there = event.key is not None and store.holds(event.key)  # what another take lends lies in a store of its own
+    memory = store.receipt(event.key).peak_memory_bytes if event.key and there else None
     return StageRecord(event.label, event.outcome, event.seconds, memory, event.reason)  # type: ignore[arg-type]  # StageRecord checks the outcome

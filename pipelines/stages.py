@@ -13,10 +13,11 @@ from pipelines.chain import Chain, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
+from sync.capture import find_capture, find_plate
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.calibrate import FindPoints, find_rig
+from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig
 from tasks.stages.encode import Encode, Verify
 from tasks.stages.evaluate import Evaluate, scored_cameras
 from tasks.stages.fitting import background_of
@@ -58,6 +59,8 @@ class Sequence:
     options: SequenceOptions
     submit: Submit
     made: Made
+    lender: Sequence | None = None
+    """The take whose rig this one uses"""
     watched: bool = False
     """Somebody may look at pictures of what is fitted before all is"""
 
@@ -104,15 +107,25 @@ class Sequence:
         )
 
     def _synchronize(self) -> None:
+        find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
         groups = self._make(synchronize(self.workshop, self.options.sync))
         check_space(self.workshop, self.plan, self.options, groups)
 
     def _calibrate(self) -> None:
         groups, plan = self.made.only("sync"), self.plan
-        rig = self._make(find_rig(self.workshop, plan, groups, self.options.pictures, self.options.rig))
+        rig = self._place()
         pictures = self.options.pictures.as_filmed
         take = Take(groups=groups, rig=rig, cameras=tuple(plan.videos), first=plan.first, pictures=pictures)
         self._make(FindPoints(take=take, fitted=plan.fitted, options=self.options.points))
+
+    def _place(self) -> Key:
+        """The rig: this take's own, or that of the lender, which makes it unless it is there."""
+        groups, pictures, options = self.made.only("sync"), self.options.pictures, self.options.rig
+        if self.lender is None:
+            return self._make(find_rig(self.workshop, self.plan, groups, pictures, options))
+        self.lender.run("sync")
+        lent = self.lender._place()
+        return self._make(borrow_rig(self.workshop, self.plan, groups, pictures, self.lender.workshop, lent, options))
 
     def _track(self) -> None:
         motion = self._make(FindMotion(take=self._take("rig"), options=self.options.motion))
@@ -122,7 +135,7 @@ class Sequence:
         take, options = self._take("points"), self.options
         background = None
         if options.fit.background.iteration_share:
-            background = self._make(background_of(take, options.fit.background))
+            background = self._make(background_of(self.workshop, take, options.fit.background))
         else:
             self.workshop.listener.skipped("background", "fit.background.iteration_share is 0")
         told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them

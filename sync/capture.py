@@ -57,6 +57,10 @@ class CaptureSettings:
     """Time column of the CSV or JSON timecodes, where there are several"""
     transfer: str | None = None
     """One of TRANSFERS: what the code values of all videos mean; None leaves it to their tags"""
+    rig_from: str | None = None
+    """Capture folder whose rig is this one's, beside this folder or absolute"""
+    clean_plate: str | None = None
+    """Folder with videos of the empty stage, filmed by the same rig; likewise"""
 
     @classmethod
     def read(cls, path: Path) -> CaptureSettings:
@@ -115,6 +119,8 @@ def find_capture(folder: Path) -> Capture:
             f"{folder} must hold videos of at least two cameras that are not ignored, but has {list(kept)}"
         )
     timecodes = _find_timecodes(folder, videos)
+    if settings.rig_from is not None and settings.calibration is not None:
+        raise ValueError(f"{path}: the rig comes from rig_from or from calibration, not both; take one of them out")
     return Capture(
         folder=folder,
         name=_name(folder, settings),
@@ -123,6 +129,52 @@ def find_capture(folder: Path) -> Capture:
         calibration=_find_calibration(folder, settings.calibration),
         settings=settings,
     )
+
+
+def find_lender(capture: Capture) -> Capture | None:
+    """The capture whose rig this one uses, at the end of the chain of `rig_from`; None if it uses its own.
+
+    Raises:
+        FileNotFoundError: a folder of the chain is missing.
+        ValueError: the chain comes back to itself, or the lender lacks a camera or a name of its own.
+    """
+    chain = [capture]
+    while (source := chain[-1].settings.rig_from) is not None:
+        path = chain[-1].folder / "capture.toml"
+        folder = _beside(chain[-1], "rig_from", source)
+        if any(folder.resolve() == take.folder.resolve() for take in chain):
+            names = " -> ".join([*(take.folder.absolute().name for take in chain), folder.name])
+            raise ValueError(f"{path}: rig_from must lead to a take with a rig of its own, but goes round: {names}")
+        chain.append(find_capture(folder))
+    lender = chain[-1]
+    if lender is capture:
+        return None
+    path = capture.folder / "capture.toml"
+    if lacking := [camera for camera in capture.cameras if camera not in lender.videos]:
+        raise ValueError(
+            f"{path}: rig_from takes the rig of {lender.folder}, which has no cameras {lacking}; list them under "
+            "'ignore', or take out rig_from to have a rig of this take's own"
+        )
+    if lender.name == capture.name:
+        raise ValueError(
+            f"{path}: results of this take and of {lender.folder}, whose rig it uses, would go into one folder, since "
+            f"both are named {capture.name!r}; give one another 'name'"
+        )
+    return lender
+
+
+def find_plate(capture: Capture) -> dict[str, Path]:
+    """Videos of the empty stage by camera, of those of this capture's cameras that have one.
+
+    Raises FileNotFoundError without the folder, ValueError when it holds no video of this capture's cameras.
+    """
+    if capture.settings.clean_plate is None:
+        return {}
+    folder = _beside(capture, "clean_plate", capture.settings.clean_plate)
+    videos = _find_videos(folder)
+    if not any(camera in capture.videos for camera in videos):
+        raise ValueError(f"{folder} must have videos of {list(capture.cameras)}, but has {list(videos)}")
+    return {camera: videos[camera] for camera in capture.cameras if camera in videos}
 
 
 def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
@@ -210,6 +262,17 @@ def _name(folder: Path, settings: CaptureSettings) -> str:
 
 def _is_short(name: str) -> bool:
     return len(name) <= LONGEST_NAME and len(name.encode("utf-8", "surrogatepass")) <= LONGEST_NAME_BYTES
+
+
+def _beside(capture: Capture, key: str, source: str) -> Path:
+    """The folder that a key of capture.toml names."""
+    folder = capture.folder.absolute().parent / source
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{capture.folder / SETTINGS}: {key} = {source!r}, but there is no folder {folder}; it is looked for "
+            f"beside {capture.folder.absolute().name}/, or give an absolute path"
+        )
+    return folder
 
 
 def _find_videos(folder: Path) -> dict[str, Path]:

@@ -3,6 +3,7 @@
 from packuv.motion.background import BackgroundOptions, Still, find_background, load_stills, save_stills
 from packuv.motion.cache import MotionCache, measure_motion
 from packuv.motion.keyframes import KeyframeOptions
+from packuv.motion.plate import Plate, compare_plate
 from packuv.motion.step import MotionOptions, changed_between
 
 __all__ = [
@@ -10,8 +11,10 @@ __all__ = [
     "KeyframeOptions",
     "MotionCache",
     "MotionOptions",
+    "Plate",
     "Still",
     "changed_between",
+    "compare_plate",
     "find_background",
     "load_stills",
     "measure_motion",

@@ -48,14 +48,16 @@ class Still:
     """bool [H, W]: most instants agree on it"""
 
 
-def find_background(views: Views, options: BackgroundOptions, progress: Progress = no_progress) -> list[Still]:
-    """Backgrounds of the cameras that filmed at least three of the chosen instants."""
+def find_background(
+    views: Views, options: BackgroundOptions, progress: Progress = no_progress, *, least: int = 3
+) -> list[Still]:
+    """Backgrounds of the cameras that filmed at least `least` of the chosen instants; an empty stage needs one."""
     instants = np.unique(np.linspace(0, len(views) - 1, min(options.instants, len(views))).round().astype(int))
     stills = []
     for camera in range(len(views.cameras)):
         pictures = [views.pixels(camera, int(instant), remember=False) for instant in instants]
         found = [picture for picture in pictures if picture is not None]
-        if len(found) >= 3:
+        if len(found) >= least:
             stills.append(_still(camera, np.stack(found), options))
         progress(camera + 1, len(views.cameras))
     return stills

@@ -13,7 +13,7 @@ import numpy as np
 from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
 from calibration.colour import BalanceOptions, balance, with_gains
 from calibration.importers import load_rig
-from calibration.judge import judge
+from calibration.judge import SharedJudgement, judge, judge_shared
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
@@ -21,7 +21,7 @@ from packuv.files import save_json
 from sync.align import FrameGroups
 from sync.capture import Capture, find_capture
 from tasks.artefacts.stage import Files, Notes, Stage, Work
-from tasks.artefacts.store import Key
+from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.footage import RIG, Footage, PictureOptions, Take
 from tasks.stages.plan import Plan
@@ -98,6 +98,57 @@ class ImportRig(Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BorrowRig(Stage):
+    """Use the rig of another take, and find cameras that were moved since: rig.json, check.json, matches.json."""
+
+    name, version = "rig", 1
+    take: Take
+    """All cameras, as filmed"""
+    first: int
+    """Instant from which on the rig is compared with the pictures"""
+    lender: str
+    """Name of the other take's sequence; its store lies beside this one's"""
+    rig: Files
+    """The other take's rig.json"""
+    options: RigOptions
+
+    def build(self, work: Work) -> Notes:
+        footage, options = Footage(self.take, work.site), self.options
+        sizes = {name: (v["width"], v["height"]) for name, v in read_videos(work.path(self.take.groups)).items()}
+        lent = Rig.load(_lent(store_of(work.site.store, self.lender), self.rig)).select(self.take.cameras)
+        rig = replace(lent, source=f"rig of {self.lender}: {lent.source}").resized(sizes)
+        work.progress(0, 1, f"comparing the rig of {self.lender} with the pictures")
+        last = len(footage.load_groups().times_ns) - 1
+        instants = np.unique(np.linspace(self.first, last, options.more_instants).round().astype(int))
+        judgement = judge_shared(rig, map(footage.filmed, instants), options=options.judge)
+        moved = {name: _moved(name, judgement, self.lender) for name in judgement.moved}
+        if not options.trust:
+            self._check(judgement, moved)
+        _save_rig(rig, options, judgement.to_json(), work.out, odd=moved)
+        unsure = [name for name in rig.names if name not in judgement.standings]
+        return {"source": self.lender, "verdict": judgement.matches.reason, "moved": moved, "unsure": unsure}
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        yield "COLMAP", f"rig of {self.lender}"
+        if notes["unsure"]:
+            names = ", ".join(notes["unsure"])
+            yield "moved cameras", f"pictures say too little to tell whether {names} stand where {self.lender} had them"
+
+    def _check(self, judgement: SharedJudgement, moved: Mapping[str, str]) -> None:
+        """Raise ValueError for a rig that cannot be used as it is."""
+        least = self.options.judge.judge.bad_share
+        lost = [name for name in moved if judgement.standings[name].fitting < least]
+        again = "take rig_from out of capture.toml to have this take's rig solved, or use it with --set rig.trust=true"
+        if lost:
+            found = "; ".join(f"{name} {moved[name]}" for name in lost)
+            names = ", ".join(f'"{name}"' for name in lost)
+            raise ValueError(f"{found}; leave it out with ignore = [{names}] in capture.toml, {again}")
+        if judgement.matches.verdict is Verdict.REJECTED:
+            reason = judgement.matches.reason
+            raise ValueError(f"the rig of {self.lender} does not agree with this take's pictures: {reason}; {again}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class SolveRig(Stage):
     """Solve the rig, from one instant, and from several if that fails: rig.json, check.json, matches.json."""
 
@@ -133,9 +184,35 @@ def find_rig(
     take = Take(groups=groups, cameras=tuple(plan.videos), pictures=pictures.as_filmed)
     source = workshop.capture.calibration
     if source is None:
-        return SolveRig(take=take, first=plan.first, options=options)
+        # Trust is of given rigs: who trusts a lent one must not have it solved again.
+        return SolveRig(take=take, first=plan.first, options=replace(options, trust=False))
     files = workshop.files(_files(source), "reading calibration")
     return ImportRig(take=take, first=plan.first, files=files, options=options)
+
+
+def borrow_rig(
+    workshop: Workshop,
+    plan: Plan,
+    groups: Key,
+    pictures: PictureOptions,
+    lender: Workshop,
+    lent: Key,
+    options: RigOptions,
+) -> BorrowRig:
+    """The stage for a capture that uses the rig of another one, which is there."""
+    name = lender.store.root.parent.name
+    return BorrowRig(
+        take=Take(groups=groups, cameras=tuple(plan.videos), pictures=pictures.as_filmed),
+        first=plan.first,
+        lender=name,
+        rig=lender.files({RIG: lender.path(lent) / RIG}, "reading rig"),
+        options=options,
+    )
+
+
+def store_of(store: Path, sequence: str) -> Path:
+    """Where the artefacts of another sequence of the same output folder are, given those of one."""
+    return store.parent.parent / sequence / store.name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,8 +275,28 @@ def complete_instants(groups: FrameGroups, cameras: tuple[str, ...], first: int)
     return found
 
 
-def _save_rig(rig: Rig, options: RigOptions, evidence: Mapping[str, Any], out: Path) -> None:
+def _lent(root: Path, rig: Files) -> Path:
+    """The rig.json of this content, from whichever recipe it was made."""
+    store, sha256 = Store(root), rig.sha256[RIG]
+    for key in store.keys():  # noqa: SIM118  # a store is no mapping
+        if store.receipt(key).outputs.get(RIG, {}).get("sha256") == sha256:
+            return store.path(key) / RIG
+    raise FileNotFoundError(f"the store {root} has lost its rig since the run began; start the run again")
+
+
+def _moved(name: str, judgement: SharedJudgement, lender: str) -> str:
+    """What the pictures say of a moved camera, for people."""
+    standing = judgement.standings[name]
+    fit = f"{standing.fitting:.0%} of its matches fit, others {judgement.usual():.0%}"
+    return f"has been moved since {lender}: {fit}, its picture lies {standing.offset_px:.1f} px off"
+
+
+def _save_rig(
+    rig: Rig, options: RigOptions, evidence: Mapping[str, Any], out: Path, *, odd: Mapping[str, str] | None = None
+) -> None:
+    """`odd` is what pictures say about single cameras."""
     report = check_rig(rig, options=options.check)
+    report = replace(report, suspicious={**report.suspicious, **(odd or {})})
     rig.save(out / RIG)
     save_json(out / CHECK, without_nan(report.to_json()))
     save_json(out / MATCHES, without_nan(evidence))

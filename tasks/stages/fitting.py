@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,14 +25,17 @@ from packuv.motion import (
     BackgroundOptions,
     MotionCache,
     MotionOptions,
+    Plate,
     Still,
     changed_between,
+    compare_plate,
     find_background,
     load_stills,
     save_stills,
 )
 from sync.align import FrameGroups
-from tasks.artefacts.stage import Notes, Stage, Work
+from sync.capture import find_capture, find_plate
+from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import POINTS
@@ -41,6 +45,7 @@ from tasks.stages.synchronize import selected
 from tasks.stages.track import MOTION
 
 SEGMENT, FIGURES, STILLS, SEAM = "segment.npz", "fit.json", "stills.npz", "seam.json"
+PLATES, REFUSED = "plates.json", "refused"
 SURE_VIEWS = 3
 """Cameras that must see a point for Gaussians to start there; two may agree by chance"""
 
@@ -57,6 +62,42 @@ class FindBackground(Stage):
         stills = find_background(Footage(self.take, work.site).open_views(), self.options, work.progress)
         save_stills(work.out / STILLS, stills)
         return {"cameras": len(stills), "known_share": float(np.mean([still.known.mean() for still in stills] or [0]))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsePlate(Stage):
+    """Take the background from videos of the empty stage, and for other cameras as ever: stills.npz, plates.json."""
+
+    name, version = "background", 1
+    take: Take
+    plate: Files
+    """Videos of the empty stage by camera"""
+    options: BackgroundOptions
+
+    def build(self, work: Work) -> Notes:
+        footage, cameras = Footage(self.take, work.site), self.take.cameras
+        own = {cameras[s.camera]: s for s in find_background(footage.open_views(), self.options, work.progress)}
+        videos = {name: video for name, video in find_plate(find_capture(work.site.capture)).items() if name in cameras}
+        views = footage.open_plate(videos, self.options.instants)
+        shown = {views.names[s.camera]: s for s in find_background(views, self.options, work.progress, least=1)}
+        plates = {name: compare_plate(still, own.get(name), self.options) for name, still in shown.items()}
+        good = {name: plate.still for name, plate in plates.items() if plate.fits}
+        stills = [replace(still, camera=cameras.index(name)) for name, still in {**own, **good}.items()]
+        stills.sort(key=lambda still: still.camera)
+        save_stills(work.out / STILLS, stills)
+        save_json(work.out / PLATES, {name: _plate_facts(plate) for name, plate in plates.items()})
+        known = float(np.mean([still.known.mean() for still in stills] or [0]))
+        without = [name for name in cameras if name not in plates]
+        refused = {name: _refusal(plate) for name, plate in plates.items() if not plate.fits}
+        relit = {name: plate.gains for name, plate in plates.items() if plate.fits and set(plate.gains) != {1.0}}
+        counts = {"cameras": len(stills), "known_share": known, "plates": len(good)}
+        return {**counts, "relit": relit, "without": without, REFUSED: refused}
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        if notes["without"]:
+            yield "clean plate", f"no video of {', '.join(notes['without'])}, which use what stands still in the take"
+        for name, why in notes[REFUSED].items():
+            yield f"clean plate of {name}", why
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,9 +239,13 @@ class MeasureSeam(Stage):
         return facts
 
 
-def background_of(take: Take, options: BackgroundOptions) -> FindBackground:
+def background_of(workshop: Workshop, take: Take, options: BackgroundOptions) -> FindBackground | UsePlate:
     """The stage for a take; how much of a fit the background gets changes nothing of what it is."""
-    return FindBackground(take=take, options=replace(options, iteration_share=BackgroundOptions().iteration_share))
+    options = replace(options, iteration_share=BackgroundOptions().iteration_share)
+    videos = {name: video for name, video in find_plate(workshop.capture).items() if name in take.cameras}
+    if not videos:
+        return FindBackground(take=take, options=options)
+    return UsePlate(take=take, plate=workshop.files(videos, "reading plate"), options=options)
 
 
 def count_pictures(workshop: Workshop, plan: Plan, groups: Key, instants: Sequence[int]) -> list[int]:
@@ -221,6 +266,23 @@ def read_losses(folder: Path) -> list[float]:
     """Loss of each frame after a segment's keyframe, NaN where nothing moved."""
     frames = json.loads((folder / FIGURES).read_text())["frames"]
     return [frame.get("loss", math.nan) for frame in frames]
+
+
+def _plate_facts(plate: Plate) -> dict[str, Any]:
+    return {
+        "used": plate.fits,
+        "known_share": float(plate.still.known.mean()),
+        "gains": plate.gains,
+        "agreement": plate.agreement,
+        "likeness": plate.likeness,
+    }
+
+
+def _refusal(plate: Plate) -> str:
+    return (
+        f"its clean plate shows another place (detail correlates by {plate.likeness:.2f}); has the camera been moved, "
+        "or the stage rebuilt? What stands still in the take serves instead"
+    )
 
 
 def _stills(work: Work, background: Key | None) -> list[Still]:

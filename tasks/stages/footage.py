@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -88,6 +89,27 @@ class Footage:
         frames = np.ascontiguousarray(groups.frames[:, columns])
         pictures = self.take.pictures
         return Views(videos, frames, lenses, max_width=pictures.max_width, transfer=pictures.transfer)
+
+    def open_plate(self, videos: Mapping[str, Path], count: int) -> Views:
+        """Up to `count` frames, spread over each video of the empty stage, as this take's cameras would show them.
+
+        Raises ValueError for a video of another size than the take's.
+        """
+        rig, reader = self.load_rig(), FrameReader(videos, transfer=self.take.pictures.transfer)
+        frames = np.full((count, len(videos)), -1, np.int32)
+        for column, (name, video) in enumerate(videos.items()):
+            height, width = reader.read(name, 0).shape[:2]
+            if (width, height) != (rig[name].width, rig[name].height):
+                raise ValueError(
+                    f"{video} must have the size of the take's video of {name}, {rig[name].width}x{rig[name].height}, "
+                    f"but has {width}x{height}; film the empty stage as the take, or leave this camera's plate out"
+                )
+            total = reader.frame_count(name)
+            chosen = np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
+            frames[: len(chosen), column] = chosen
+        lenses = [lens_camera(rig[name]) for name in videos]
+        pictures = self.take.pictures
+        return Views(videos, frames, lenses, max_width=pictures.max_width, transfer=pictures.transfer, reader=reader)
 
     def filmed(self, instant: int) -> dict[str, np.ndarray]:
         """Pictures as filmed, uint8 [H, W, 3] RGB, of the cameras that have one at this instant of the take."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -103,7 +104,9 @@ def _measure_here() -> Found:
     from tasks.artefacts.stage import Site, Stage, Work
     from tasks.artefacts.store import Key, Store
     from tasks.artefacts.workshop import Workshop
-    from tasks.stages.fitting import CutSegment, FitNext
+    from tasks.stages.calibrate import borrow_rig
+    from tasks.stages.fitting import CutSegment, FitNext, background_of
+    from tasks.stages.footage import Take
     from tasks.stages.plan import Plan
 
     capture, found = find_capture(FOLDER / "capture"), Found()
@@ -121,10 +124,10 @@ def _measure_here() -> Found:
             return self.key
 
     with tempfile.TemporaryDirectory() as folder:
-        store = Store(Path(folder) / "store")
+        store = Store(Path(folder) / capture.name / "store")
         site = Site(store.root, capture.folder, 1)
 
-        def make(stage: Stage) -> Key:
+        def make(stage: Stage, site: Site = site) -> Key:
             def build(building: Any) -> Mapping[str, Any]:
                 return stage.build(Work(site, building.out, building.scratch, no_progress))
 
@@ -147,6 +150,13 @@ def _measure_here() -> Found:
 
         sequence = Sequence(workshop, plan, options, submit, Made(), watched=True)
         sequence.run("report")
+        only, rig = sequence.made.only, options.rig
+        make(borrow_rig(workshop, plan, only("sync"), workshop, only("rig"), rig))
+        empty = _copied(capture.folder, Path(folder) / "take02", clean_plate=capture.folder)
+        take = Take(groups=only("sync"), rig=only("points"), cameras=plan.fitted, stop=3)
+        make(
+            background_of(replace(workshop, capture=empty), take, options.fit.background), replace(site, capture=empty)
+        )
         segment = sequence.made.keys["segment"][0]
         make(CutSegment(segment=segment, frames=2))
         following = next(stage for stage in steps if isinstance(stage, FitNext))
@@ -157,6 +167,14 @@ def _measure_here() -> Found:
             "outputs": _content(store.path(make(going_on))),
         }
     return found
+
+
+def _copied(capture: Path, target: Path, **keys: Path) -> Path:
+    """A copy of a capture whose capture.toml says more."""
+    shutil.copytree(capture, target)
+    lines = [f'{name} = "{value}"' for name, value in keys.items()]
+    (target / "capture.toml").write_text("\n".join([(capture / "capture.toml").read_text(), *lines]))
+    return target
 
 
 def _inputs(stage: Any, made: Mapping[str, str]) -> str:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sync.capture
-from sync.capture import CaptureSettings, check_name, find_capture, load_timecodes
+from sync.capture import CaptureSettings, check_name, find_capture, find_lender, find_plate, load_timecodes
 from sync.clock import ClockMode
 from sync.probe import ColourTags, VideoInfo
 
@@ -97,6 +97,7 @@ def test_settings_are_read(tmp_path: Path) -> None:
         ("ignore = ['cam1']\nreference = 'cam1'", r"\['cam1'\] cannot be ignored"),
         ("ignore = ['cam1', 'cam2']", "at least two cameras"),
         ("calibration = 'rig.json'", "calibration = 'rig.json', but .* is not there"),
+        ("calibration = 'solve'\nrig_from = 'take01'", "from rig_from or from calibration, not both"),
     ],
 )
 def test_bad_settings_are_named(tmp_path: Path, text: str, message: str) -> None:
@@ -293,6 +294,57 @@ def test_of_several_calibrations_one_must_be_named(tmp_path: Path) -> None:
         find_capture(folder)
     make_capture(folder, settings="calibration = 'calibration/a.toml'")
     assert find_capture(folder).calibration == folder / "calibration" / "a.toml"
+
+
+# Other folders of the day
+
+
+def make_day(folder: Path, **rig_from: str | None) -> None:
+    """Takes, each with the rig of another one or with its own."""
+    for name, source in rig_from.items():
+        make_capture(folder / name, *VIDEOS, settings=f'rig_from = "{source}"' if source else "")
+
+
+def test_a_chain_of_takes_leads_to_the_one_with_a_rig_of_its_own(tmp_path: Path) -> None:
+    make_day(tmp_path, take01=None, take02="take01", take03="take02", far=str(tmp_path / "take03"))
+    assert find_lender(find_capture(tmp_path / "take01")) is None
+    for name in ("take02", "take03", "far"):
+        lender = find_lender(find_capture(tmp_path / name))
+        assert lender is not None
+        assert lender.name == "take01"
+
+
+def test_a_chain_that_goes_round_or_ends_nowhere_is_refused(tmp_path: Path) -> None:
+    make_day(tmp_path, a="b", b="c", c="b", own="own", lost="take99")
+    for name, way in (("a", "a -> b -> c -> b"), ("own", "own -> own")):
+        with pytest.raises(ValueError, match=f"goes round: {way}"):
+            find_lender(find_capture(tmp_path / name))
+    with pytest.raises(FileNotFoundError, match="rig_from = 'take99', but there is no folder"):
+        find_lender(find_capture(tmp_path / "lost"))
+
+
+def test_a_lender_needs_all_cameras_and_another_name(tmp_path: Path) -> None:
+    make_capture(tmp_path / "take01", *VIDEOS)
+    more = make_capture(tmp_path / "take02", *VIDEOS, "videos/cam11.mp4", settings='rig_from = "take01"')
+    with pytest.raises(ValueError, match=r"has no cameras \['cam11'\]; list them under 'ignore'"):
+        find_lender(find_capture(more))
+    (more / "capture.toml").write_text('rig_from = "take01"\nignore = ["cam1", "cam11"]')
+    assert find_lender(find_capture(more)) == find_capture(tmp_path / "take01")
+    (more / "capture.toml").write_text('rig_from = "take01"\nignore = ["cam11"]\nname = "take01"')
+    with pytest.raises(ValueError, match="would go into one folder"):
+        find_lender(find_capture(more))
+
+
+def test_a_plate_has_videos_of_some_cameras(tmp_path: Path) -> None:
+    take = make_capture(tmp_path / "take01", *VIDEOS, settings='clean_plate = "empty"')
+    with pytest.raises(FileNotFoundError, match="clean_plate = 'empty', but there is no folder"):
+        find_plate(find_capture(take))
+    plate = make_capture(tmp_path / "empty", "videos/cam2.mp4", "videos/witness.mp4")
+    assert find_plate(find_capture(take)) == {"cam2": plate / "videos/cam2.mp4"}
+    (plate / "videos/cam2.mp4").unlink()
+    with pytest.raises(ValueError, match="must have videos of"):
+        find_plate(find_capture(take))
+    assert find_plate(find_capture(make_capture(tmp_path / "take02", *VIDEOS))) == {}
 
 
 def test_docstring_examples_hold() -> None:

@@ -1,0 +1,84 @@
+"""When a take goes on with the rig of another one, and what it says when it does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from calibration.accept import MatchesReport, Verdict
+from calibration.judge import SharedJudgement
+from calibration.moved import Standing
+from pipelines.events import Journal
+from tasks.artefacts.jobs import Jobs
+from tasks.artefacts.stage import Files, Site
+from tasks.artefacts.store import Key, Store
+from tasks.artefacts.workshop import Workshop
+from tasks.stages.calibrate import BorrowRig, RigOptions, _lent, _moved, find_rig, store_of
+from tasks.stages.footage import RIG, Take
+from tasks.stages.plan import Plan
+from tests.support.artefacts import put
+
+NAMES = ("cam01", "cam02", "cam03", "cam04")
+STAGE = BorrowRig(
+    take=Take(groups=Key("sync", "0" * 64), cameras=NAMES),
+    first=0,
+    lender="take01",
+    rig=Files({}),
+    options=RigOptions(),
+)
+
+
+def judgement(*, fitting: float, verdict: Verdict = Verdict.ACCEPTED) -> SharedJudgement:
+    """cam03 was moved."""
+    right = Standing(points=90, fitting=0.93, agreeing=0.95, offset_px=0.4, turned_deg=0.1, shifted=0.001)
+    moved = replace(right, fitting=fitting, offset_px=6.5)
+    report = MatchesReport(5, 900, 0.9, 0.3, {}, (), None, verdict, "the poses explain 3% of the matches")
+    return SharedJudgement({name: moved if name == "cam03" else right for name in NAMES}, ("cam03",), report)
+
+
+def check(found: SharedJudgement) -> None:
+    STAGE._check(found, {name: _moved(name, found, "take01") for name in found.moved})
+
+
+def test_a_camera_that_was_moved_a_little_is_a_finding():
+    found = judgement(fitting=0.7)
+    check(found)
+    text = "has been moved since take01: 70% of its matches fit, others 93%, its picture lies 6.5 px off"
+    assert _moved("cam03", found, "take01") == text
+
+
+def test_a_camera_that_cannot_be_used_ends_the_run_and_says_what_to_do():
+    with pytest.raises(ValueError, match=r'cam03 has been moved .*12% of its matches.*ignore = \["cam03"\].*rig_from'):
+        check(judgement(fitting=0.12))
+
+
+def test_a_rig_that_is_wrong_altogether_is_told_from_a_moved_camera():
+    with pytest.raises(
+        ValueError, match="the rig of take01 does not agree with this take's pictures: the poses explain"
+    ):
+        check(judgement(fitting=0.7, verdict=Verdict.REJECTED))
+
+
+def test_a_lent_rig_is_found_by_its_content(tmp_path):
+    root = store_of(tmp_path / "take02" / "store", "take01")
+    assert root == tmp_path / "take01" / "store"
+    site = Site(root, tmp_path, 1)
+    keys = [put(site, "rig", lambda out, text=text: (out / RIG).write_text(text), text=text) for text in ("a", "b")]
+    store = Store(root)
+    for key in keys:
+        sha256 = store.receipt(key).outputs[RIG]["sha256"]
+        assert _lent(root, Files({RIG: sha256})) == store.path(key) / RIG
+    with pytest.raises(FileNotFoundError, match="has lost its rig"):
+        _lent(root, Files({RIG: "0" * 64}))
+
+
+def test_who_trusts_a_rig_that_was_lent_does_not_have_it_solved_again(tmp_path):
+    (tmp_path / "videos").mkdir()
+    videos = {name: tmp_path / "videos" / f"{name}.mp4" for name in NAMES}
+    for video in videos.values():
+        video.write_bytes(b"content")
+    workshop = Workshop(Store(tmp_path / "store"), tmp_path, Jobs(threads=1), Journal())
+    plan = Plan(tmp_path, videos, (), 0, None, "cpu", side_by_side=False)
+    stages = [find_rig(workshop, plan, STAGE.take.groups, RigOptions(trust=trust)) for trust in (False, True)]
+    assert stages[0] == stages[1]
