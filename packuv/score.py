@@ -148,10 +148,9 @@ def with_own_gain(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """float32 [3, H, W] in [0, 1], RGB, as an 8-bit PNG; raises OSError if it cannot be written."""
+    """float32 [3, H, W] in [0, 1], RGB, as an 8-bit PNG."""
     pixels = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8).transpose(1, 2, 0)
-    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels[:, :, ::-1])):
-        raise OSError(f"cannot write {path}")
+    path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, ::-1]))[1].tobytes())
 
 
 def write_table(path: Path, scores: Sequence[Score]) -> None:

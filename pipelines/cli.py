@@ -1,16 +1,18 @@
 """The `packuv` command.
 
-Exit code 0: done; 1: the run failed; 2: wrong usage or bad input, with one sentence on stderr; 130: stopped by Ctrl-C.
+Exit code 0: done; 1: the run failed; 2: wrong usage or bad input, with one sentence on stderr; 130: stopped by Ctrl-C;
+129, 143: ended by SIGHUP, SIGTERM.
 Nothing heavy is imported before a command is chosen, so that `packuv --help` answers at once.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import errno
 import importlib
 import os
 import re
-import signal
 import sys
 import tempfile
 import traceback
@@ -23,10 +25,13 @@ from typing import Any, NoReturn
 import packuv
 from packuv.gaussians.uvsize import UvOptions
 from pipelines import plugins
+from pipelines.commands.output import check_written, lasting_output
+from pipelines.disk import free_bytes, size_text
+from pipelines.ending import Terminated, ending_gently
 from pipelines.request import PRESETS, QUALITIES, STAGES, parse_range
 from tasks.artefacts.jobs import CancelledError
 
-OK, FAILED, WRONG, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+OK, FAILED, WRONG, INTERRUPTED = 0, 1, 2, 130
 SINGLE = {
     "sync": "match the frames of all cameras to instants",
     "calibrate": "import or solve the cameras, triangulate points, balance colours",
@@ -37,13 +42,12 @@ SINGLE = {
 """Commands that run the stages up to the one they name"""
 BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
+WRONG_PATH = frozenset({errno.ENAMETOOLONG, errno.ELOOP})
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+
 
 class UsageError(ValueError):
     """The command line cannot be understood."""
-
-
-class Terminated(BaseException):
-    """SIGTERM came."""
 
 
 class _Help(argparse.HelpFormatter):
@@ -88,28 +92,38 @@ class _Version(argparse.Action):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the `packuv` command with these arguments, by default those of the process; returns the exit code."""
+    with lasting_output(), ending_gently():
+        return _outcome(sys.argv[1:] if argv is None else argv)
+
+
+def _outcome(words: Sequence[str]) -> int:
+    """Exit code of the command that these words are; what went wrong is said."""
+    arguments = argparse.Namespace()
     try:
-        arguments = parser().parse_args(argv)
-        _end_gently_on_sigterm()
+        arguments = _parsed(words)
         return _load(arguments.function)(arguments)
     except UsageError as error:
-        words = sys.argv[1:] if argv is None else argv
         return _say(WRONG, (words and plugins.missing(words[0])) or error)
     except BAD_INPUT as error:
-        return _say(WRONG, _system_message(error) if isinstance(error, OSError) else error)
+        return _say(WRONG, _system_message(error, arguments) if isinstance(error, OSError) else error)
     except KeyboardInterrupt:
         return _say(INTERRUPTED, "stopped; the same command goes on from here")
-    except Terminated:
-        return _say(TERMINATED, "ended by SIGTERM; the same command goes on from here")
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # `packuv info SCENE | head` is no failure
-        return OK
+    except Terminated as signal:
+        return _say(signal.code, f"ended by {signal}; the same command goes on from here")
     except CancelledError as error:
         return _say(FAILED, error)
     except OSError as error:  # a full disk, a lost network: the system's fault, and its message says all
-        return _say(FAILED, _system_message(error))
+        return _say(WRONG if error.errno in WRONG_PATH else FAILED, _system_message(error, arguments))
     except Exception as error:
-        return _say(FAILED, f"{_first_sentence(error)}; the traceback is in {_write_log(error)}")
+        return _say(FAILED, f"{_first_sentence(error)}; {_log_of(error)}")
+
+
+def _parsed(words: Sequence[str]) -> argparse.Namespace:
+    try:
+        return parser().parse_args(words)
+    except SystemExit:  # after --help and --version, which are an answer, too
+        check_written()
+        raise
 
 
 def _load(name: str) -> Callable[[argparse.Namespace], int]:
@@ -118,34 +132,41 @@ def _load(name: str) -> Callable[[argparse.Namespace], int]:
     return found
 
 
-def _end_gently_on_sigterm() -> None:
-    def end(number: int, frame: object) -> None:
-        raise Terminated
-
-    signal.signal(signal.SIGTERM, end)
-
-
 def _say(code: int, problem: object) -> int:
     """One line on stderr."""
     print(f"packuv: {' '.join(str(problem).split())}", file=sys.stderr)
     return code
 
 
-def _system_message(error: OSError) -> str:
-    """Without the number; with the file if there is one."""
+def _system_message(error: OSError, arguments: argparse.Namespace) -> str:
+    """Without the number; with the file, or else the folder that the command writes to, and the room there."""
     what = error.strerror or re.sub(r"^\[Errno \d+\] ", "", str(error))
-    return f"{what}: {error.filename}" if error.filename else what
+    if error.errno not in FULL or (what != os.strerror(error.errno) and not error.filename):
+        return f"{what}: {error.filename}" if error.filename else what
+    place = Path(error.filename or getattr(arguments, "out", None) or getattr(arguments, "output", None) or "")
+    return f"{os.strerror(error.errno)}: {place.absolute()}: {_room(place)}free some and run the same command again"
+
+
+def _room(place: Path) -> str:
+    with contextlib.suppress(OSError):  # the disk is gone
+        return f"{size_text(free_bytes(place))} are free; "
+    return ""
 
 
 def _first_sentence(error: Exception) -> str:
     return str(error).split("; the traceback is in ")[0] or type(error).__name__
 
 
-def _write_log(error: Exception) -> Path:
-    """The file with the traceback: the job's own log where a job failed."""
+def _log_of(error: Exception) -> str:
+    """Where the traceback is: in the job's own log where a job failed."""
     log: Path | None = getattr(error, "log", None)
-    if log is not None:
-        return log
+    try:
+        return f"the traceback is in {log or _write_log(error)}"
+    except OSError as problem:
+        return f"no place for the traceback: {problem.strerror or problem}"
+
+
+def _write_log(error: Exception) -> Path:
     with tempfile.NamedTemporaryFile("w", prefix="packuv-", suffix=".log", delete=False) as file:
         traceback.print_exception(error, file=file)
         return Path(file.name)
@@ -186,6 +207,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _web(command("web", "pipelines.commands.exchange:web", "write a scene as static files for any web server"))
     _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
+    _serve(command("serve", "pipelines.commands.serve:serve", "keep a dashboard, and run by form, script or schedule"))
     _status(command("status", "pipelines.commands.watch:status", "tell what runs, what failed and what is done"))
     _cancel(command("cancel", "pipelines.commands.watch:cancel", "end runs within seconds; they can go on later"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
@@ -231,6 +253,17 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
     _seed(command)
     _set(command, "a setting of a stage; wins over --config and --preset")
     _json(command)
+
+
+def _serve(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/")
+    command.add_argument("--data", type=Path, default=None, metavar="PATH", help="manifest, or folder of captures")
+    command.add_argument("--cron", default=None, metavar="EXPR", help="when to process all of it, as '0 2 * * *'")
+    command.add_argument("--timezone", default="UTC", help="that --cron means")
+    command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
+    command.add_argument("--at-once", type=_positive, default=1, metavar="N", help="runs at a time")
+    command.add_argument("--host", default="127.0.0.1", help="address of the dashboard, which has no password")
+    command.add_argument("--port", type=_positive, default=4200, help="of the dashboard")
 
 
 def _status(command: argparse.ArgumentParser) -> None:

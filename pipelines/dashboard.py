@@ -28,7 +28,7 @@ from pipelines.link import Link
 from pipelines.process import Outcome
 from pipelines.request import RunRequest
 from pipelines.server import results_url
-from pipelines.words import duration, ending, state
+from pipelines.words import duration, outcome, state
 from sync.align import SyncReport
 from sync.capture import Capture
 from tasks.artefacts.store import Store
@@ -79,7 +79,7 @@ class Dashboard:
 
     def ended(self, event: Event) -> None:
         level = logging.ERROR if event.outcome == "failed" and not event.stopped else logging.INFO
-        self._logger().log(level, "%s: %s", event.label, event.reason or ending(event))
+        self._logger().log(level, "%s: %s", event.label, outcome(event))
         if event.label in self._bars and event.outcome == "made":
             self._bar(event.label, 1.0, f"done in {duration(event.seconds)}")
         if event.key is not None and event.key.stage in SHOWN:
@@ -88,18 +88,18 @@ class Dashboard:
     def told(self, label: str, text: str) -> None:
         self._log.info("%s: %s", label, text)
 
-    def summarize(self, outcome: Outcome) -> None:
+    def summarize(self, results: Outcome) -> None:
         """Where the results are, and how good."""
-        address = results_url(outcome.report)
+        address = results_url(results.report)
         lines = [
             f"# {self._sequence}",
-            f"[Open the report]({address}) ({outcome.report})",
+            f"[Open the report]({address}) ({results.report})",
             "```",
-            outcome.farewell(),
+            results.farewell(),
             "```",
         ]
         self._artifact("summary", "markdown", "\n\n".join(lines), "What came out of the run")
-        self._log.info("%s", outcome.farewell())
+        self._log.info("%s", results.farewell())
 
     def sync(self, folder: Path) -> None:
         report = SyncReport.load(folder)
@@ -160,7 +160,7 @@ class Dashboard:
             if label in self._bars:
                 client.update_artifact(self._bars[label], ArtifactUpdate(data=data, description=description))
             else:
-                made = self._create(client, f"progress-{label}", "progress", data, description, run)
+                made = self._create(client, "progress", "progress", data, description, run)
                 self._bars[label] = made
 
         self._link.post(post, instead_of=label)

@@ -94,6 +94,7 @@ class Journal:
         self._clock = clock
         self._active: dict[str, Forecast] = {}
         self._lock = threading.RLock()
+        self._ended = threading.Condition(self._lock)
 
     @contextmanager
     def heard_by(self, audience: Audience) -> Iterator[None]:
@@ -142,6 +143,11 @@ class Journal:
         stopped = isinstance(error, (CancelledError, KeyboardInterrupt))
         self._end(Event(label, "failed", self._seconds(label), reason=str(error), stopped=stopped))
 
+    def wait_until_idle(self, seconds: float) -> bool:
+        """Return when no stage is under way, or after this time; whether none is."""
+        with self._ended:
+            return self._ended.wait_for(lambda: not self._active, timeout=seconds)
+
     def _seconds(self, label: str) -> float:
         with self._lock:
             return self._clock() - self._active[label].start if label in self._active else 0.0
@@ -150,5 +156,6 @@ class Journal:
         with self._lock:
             self._active.pop(event.label, None)
             self.events.append(event)
+            self._ended.notify_all()
             for audience in self._audience:
                 audience.ended(event)

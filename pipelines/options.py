@@ -7,11 +7,12 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from packuv.fit.options import FitOptions
+from packuv.footage import Transfer
 from packuv.motion import KeyframeOptions, MotionOptions
 from packuv.scene import TOLERANCES, EncodeOptions, Quality
 from pipelines.request import PRESETS, QUALITIES
 from sync.align import AlignOptions
-from sync.capture import CaptureSettings
+from sync.capture import TRANSFERS, CaptureSettings
 from tasks.artefacts.recipe import override
 from tasks.stages.calibrate import PointOptions, RigOptions
 from tasks.stages.evaluate import EvaluateOptions
@@ -61,6 +62,7 @@ _PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 assert tuple(_PRESETS) == PRESETS
 assert tuple(Quality) == QUALITIES
+assert tuple(Transfer) == TRANSFERS
 
 
 def compose(
@@ -76,6 +78,7 @@ def compose(
     Raises OptionError that names an unknown setting, with the valid names, or a value of the wrong kind.
     """
     options = override(SequenceOptions(), _PRESETS[preset])
-    options = override(options, {"sync": {"reference": capture.reference, "clock": capture.clock}})
+    said = {"sync": {"reference": capture.reference, "clock": capture.clock}}
+    options = override(options, {**said, "pictures": {"transfer": capture.transfer}})
     tolerance = asdict(TOLERANCES[Quality(quality)])
     return override(override(options, {"fit": {"seed": seed}, "encode": {"tolerance": tolerance}}), settings)

@@ -7,6 +7,7 @@ import shlex
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,6 +37,8 @@ from tasks.stages.encode import SCENE
 from tasks.stages.plan import Plan
 
 PARTIAL = "scene.partial.mkv"
+IDLE_SECONDS = 5.0
+"""For stages that are cut to say so"""
 MOST_FINDINGS = 8
 """That the terminal shows"""
 CORES_PER_JOB = 4
@@ -131,22 +134,23 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
     sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), engine.watched)
     run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
-    ending = Ending("finished")
     on_record = registered(
         folder, sequence=run.name, capture=request.capture, preset=request.preset, engine=engine.place
     )
     with workshop.store.in_use(), on_record as register, journal.heard_by(register):
         try:
             sequence.run(request.stop_after)
-            return _publish(run, folder)
+            outcome = _publish(run, folder)
         except BaseException as error:
             jobs.cancel()
-            ending = ending_of(error)
-            if isinstance(error, (Exception, KeyboardInterrupt)) and not isinstance(error, CancelledError):
-                _leave_finished(sequence, folder)
+            journal.wait_until_idle(IDLE_SECONDS)
+            with suppress(OSError):  # the first fault counts
+                write_json(folder / RUN, run_json(run, ending_of(error)))
+                if isinstance(error, (Exception, KeyboardInterrupt)) and not isinstance(error, CancelledError):
+                    _leave_finished(sequence, folder)
             raise
-        finally:
-            write_json(folder / RUN, run_json(run, ending))
+        write_json(folder / RUN, run_json(run, Ending("finished")))
+        return outcome
 
 
 def find_sequence(request: RunRequest) -> Capture:

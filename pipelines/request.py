@@ -33,7 +33,7 @@ class RunRequest:
     capture: str
     """Capture folder, an absolute path"""
     out: str
-    """Results go to OUT/<name of the sequence>/, an absolute path"""
+    """Output folder, an absolute path; results go to a folder in it with the name of the sequence"""
     name: str | None = None
     """Of the sequence; none: what capture.toml or the folder says. Needed where two captures bear the same name"""
     preset: Preset = "standard"

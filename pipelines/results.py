@@ -29,12 +29,17 @@ from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
 from tasks.report.facts import Comparison, MotionCurve, ReportInput, SceneFigures, StageRecord, scene_figures
+from tasks.report.write import JSON_NAME, PAGE_NAME
 from tasks.stages.calibrate import CHECK
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
 from tasks.stages.footage import RIG
 from tasks.stages.plan import Plan
+from tasks.stages.synchronize import read_videos
 from tasks.stages.track import read_curve, read_keyframes
+
+WHOLE = (SCENE, PAGE_NAME, JSON_NAME, "run.json")
+"""Files of a run that came to its end, in its folder"""
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,7 @@ def ending_of(error: BaseException) -> Ending:
         return Ending("cancelled", str(error))
     if isinstance(error, Exception):
         return Ending("failed", str(error) or type(error).__name__)
-    return Ending("stopped", str(error) or type(error).__name__)
+    return Ending("stopped", "Ctrl-C" if isinstance(error, KeyboardInterrupt) else "ended by a signal")
 
 
 def run_json(run: Run, ending: Ending) -> dict[str, Any]:
@@ -107,6 +112,13 @@ def _artefact(store: Store, key: Any) -> dict[str, Any]:
     }
 
 
+def check_whole(folder: Path) -> None:
+    """Raise OSError if a file that a whole run leaves is not there, as where somebody removed it meanwhile."""
+    for name in WHOLE:
+        if not (folder / name).is_file():
+            raise OSError(f"the run came to its end, but {folder / name} is not there; run the same command again")
+
+
 def collect(run: Run) -> ReportInput:
     """What the stages left, for the report; parts that the run did not come to are missing."""
     now = datetime.now(UTC)
@@ -123,6 +135,8 @@ def collect(run: Run) -> ReportInput:
         rig=Rig.load(rig_folder / RIG) if rig_folder else None,
         held_out=run.plan.held_out,
         check=_check(run.folder("rig")),
+        colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
+        log_like=_log_like(run),
         motion=_curve(run.folder("keyframes")),
         scores=_scores(run.folder("evaluate")),
         scene=_scene(run),
@@ -135,6 +149,11 @@ def _check(folder: Path | None) -> RigReport | None:
     if folder is None:
         return None
     return RigReport(**json.loads((folder / CHECK).read_text()))
+
+
+def _log_like(run: Run) -> tuple[str, ...]:
+    points = run.made.get("points")
+    return tuple(run.workshop.store.receipt(points).notes["log_like"]) if points else ()
 
 
 def _curve(folder: Path | None) -> MotionCurve | None:

@@ -9,6 +9,7 @@ long as it takes, and writes to a log file. It has the dashboard, and hands out 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import json
 import os
@@ -31,6 +32,7 @@ from tasks.artefacts.store import try_lock
 
 START_SECONDS = 300
 DATABASE = "prefect.db"
+MEMORY = Path("/dev/shm")
 RESULTS = "/results"
 """Path under which our servers hand out the output folder"""
 RESULTS_VARIABLE = "PACKUV_RESULTS"
@@ -40,6 +42,7 @@ QUIET = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+    "PREFECT_LOGGING_INTERNAL_LEVEL": "CRITICAL",  # or it says that the server is gone, which the run has ended
     "PREFECT_SERVER_LOGGING_LEVEL": "WARNING",  # into the server's log file
     "PREFECT_CLI_COLORS": "false",
     # Slow machines and shared disks: wait rather than fail.
@@ -70,8 +73,8 @@ class Server:
     """What it says; None for a server that was there before"""
     process: subprocess.Popen[bytes] | None = None
     """Likewise"""
-    fresh: bool = False
-    """Its database is new"""
+    fresh: Path | None = None
+    """Its database, where that had to be set up"""
 
     @property
     def dashboard(self) -> str:
@@ -86,8 +89,8 @@ class Server:
         except (urllib.error.URLError, OSError) as problem:
             where = f"; see {self.log}" if self.log else " (PREFECT_API_URL)"
             raise RuntimeError(f"no workflow server at {self.address}{where}: {problem}; --direct needs none") from None
-        if self.fresh and self.log:
-            _keep_empty(self.log.with_name(DATABASE))
+        if self.fresh:
+            _keep_empty(self.fresh)
 
     def died(self) -> bool:
         """Whether a server that the run brought along has ended."""
@@ -99,33 +102,45 @@ def workflow_server(out: Path) -> Iterator[Server]:
     """Have Prefect's settings in the environment and its server running, or starting.
 
     Enter before anything imports prefect. A server that the user names, in PREFECT_API_URL or in Prefect's profile, is
-    taken as it is, then that of a `packuv serve` for this output folder. Else one is started that keeps its database
-    in PREFECT_HOME or, without that, under `out`/.prefect.
+    taken as it is, then that of a `packuv serve` for this output folder. Else one is started that keeps its log in
+    PREFECT_HOME or, without that, under `out`/.prefect, and its database in memory, for that is of no use afterwards.
     """
-    with _environment(QUIET):
-        if address := os.environ.get("PREFECT_API_URL") or _profile_address():
-            with _environment({"PREFECT_API_URL": address}):
-                yield Server(address.rstrip("/"))
+    with override(QUIET, keep=True):
+        if named := named_server():
+            with override({"PREFECT_API_URL": named.address}):
+                yield named
             return
         if served := find_served(out):
-            with _environment({"PREFECT_API_URL": served, **_results(served, out)}):
+            with override({"PREFECT_API_URL": served, **_results(served, out)}):
                 yield Server(served)
             return
-        with _home(out) as (home, lock), running_server(home, lock, out, settings=EMBEDDED) as server:
+        with (
+            _home(out) as (home, lock),
+            _passing(home) as database,
+            running_server(home, lock, out, database=database, settings=EMBEDDED) as server,
+        ):
             yield server
 
 
 @contextlib.contextmanager
 def running_server(
-    home: Path, lock: BinaryIO, out: Path, *, settings: Mapping[str, str], host: str = "127.0.0.1", port: int = 0
+    home: Path,
+    lock: BinaryIO,
+    out: Path,
+    *,
+    database: Path,
+    settings: Mapping[str, str],
+    host: str = "127.0.0.1",
+    port: int = 0,
 ) -> Iterator[Server]:
-    """Have a server with its database in `home`, which dies with this process; raises OSError for a port in use."""
-    fresh, log = _take_empty(home / DATABASE), home / "server.log"
+    """Have a server that dies with this process; raises OSError for a port in use."""
+    fresh, log = _take_empty(database), home / "server.log"
+    settings = {**settings, "PREFECT_SERVER_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{database}"}
     # The kernel queues what comes before the server accepts, and refuses what comes after the server has died.
     with socket.create_server((host, port)) as listener, open(log, "wb") as output:
         address = f"http://{host}:{listener.getsockname()[1]}/api"
         ours = {"PREFECT_HOME": str(home), "PREFECT_API_URL": address, "PREFECT_UI_API_URL": address}
-        with _environment({**settings, **_results(address, out)}), _override(ours):
+        with override({**settings, **_results(address, out)}, keep=True), override(ours):
             process = subprocess.Popen(
                 [sys.executable, "-P", "-m", __name__, str(os.getpid()), str(listener.fileno()), str(out.absolute())],
                 stdin=subprocess.DEVNULL,
@@ -136,10 +151,16 @@ def running_server(
             )
             listener.close()
             try:
-                yield Server(address, log, process, fresh)
+                yield Server(address, log, process, database if fresh else None)
             finally:
                 process.kill()  # nothing in its database is needed again, and its own shutdown takes seconds
                 process.wait()
+
+
+def named_server() -> Server | None:
+    """The server that the user names, in PREFECT_API_URL or in Prefect's profile."""
+    address = os.environ.get("PREFECT_API_URL") or _profile_address()
+    return Server(address.rstrip("/")) if address else None
 
 
 def results_url(path: Path) -> str:
@@ -191,15 +212,9 @@ def _profile_address() -> str | None:
 
 
 @contextlib.contextmanager
-def _environment(defaults: Mapping[str, str]) -> Iterator[None]:
-    """Set variables that are not set; undo it afterwards."""
-    with _override({name: value for name, value in defaults.items() if name not in os.environ}):
-        yield
-
-
-@contextlib.contextmanager
-def _override(values: Mapping[str, str]) -> Iterator[None]:
-    """Set variables; undo it afterwards."""
+def override(values: Mapping[str, str], *, keep: bool = False) -> Iterator[None]:
+    """Set environment variables, with `keep` only those that are not set; undo it afterwards."""
+    values = {name: value for name, value in values.items() if not keep or name not in os.environ}
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -209,6 +224,17 @@ def _override(values: Mapping[str, str]) -> Iterator[None]:
             os.environ.pop(name, None)
             if value is not None:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def own_home(out: Path, name: str) -> Iterator[tuple[Path, BinaryIO]]:
+    """The one folder of a server that stays; raises RuntimeError where it is in use."""
+    home = out.absolute() / ".prefect" / name
+    home.mkdir(parents=True, exist_ok=True)
+    with open(home / "in_use.lock", "ab") as lock:
+        if not try_lock(lock.fileno()):
+            raise RuntimeError(f"{home} is in use: a packuv serve for {out} is running already")
+        yield home, lock
 
 
 @contextlib.contextmanager
@@ -230,6 +256,25 @@ def _homes(out: Path) -> Iterator[Path]:
     yield from (base / str(number) for number in itertools.count())
 
 
+@contextlib.contextmanager
+def _passing(home: Path) -> Iterator[Path]:
+    """A database that goes with the run, in memory where the system has a place for that: a full disk is no matter of
+    the engine. Its name follows from the folder, so that what a killed run left is taken away by the next one."""
+    name = hashlib.sha256(f"{os.getuid()} {home}".encode()).hexdigest()[:16]
+    path = MEMORY / f"packuv-{name}.db" if os.access(MEMORY, os.W_OK) else home / DATABASE
+    _remove(path)
+    try:
+        yield path
+    finally:
+        _remove(path)
+
+
+def _remove(database: Path) -> None:
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        with contextlib.suppress(OSError):
+            database.with_name(f"{database.name}{suffix}").unlink()
+
+
 def _template() -> Path:
     """An empty database of this version of the engine, which takes seconds to set up."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
@@ -240,12 +285,13 @@ def _take_empty(database: Path) -> bool:
     """Start a database that is not there with the empty one; whether there was none."""
     if database.exists():
         return False
-    with contextlib.suppress(OSError):
-        part = database.with_name(f".{database.name}.part")
-        part.write_bytes(_template().read_bytes())
-        os.replace(part, database)
-        return False
-    return True
+    try:
+        empty = _template().read_bytes()
+    except OSError:
+        return True
+    with open(os.open(database, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(empty)
+    return False
 
 
 def _keep_empty(database: Path) -> None:

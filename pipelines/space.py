@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import errno
-import shutil
-from pathlib import Path
 
 from packuv.motion.step import fitted_size
+from pipelines.disk import free_bytes, size_text, used_bytes
 from pipelines.options import SequenceOptions
 from sync.align import FrameGroups
 from tasks.artefacts.store import Key
@@ -24,14 +23,17 @@ COPIES = 3
 
 
 def check_space(workshop: Workshop, plan: Plan, options: SequenceOptions, groups: Key) -> None:
-    """Raise OSError (no space) if the disk under the store has less room than the run is likely to need."""
-    needed = forecast_bytes(workshop, plan, options, groups)
-    free = shutil.disk_usage(_existing(workshop.store.root)).free
-    if free < needed * MARGIN:
+    """Raise OSError (no space) if the disk under the store has less room than the run is likely to need.
+
+    What lies in the store counts as written by this run, so that a run that stopped may go on where it fits.
+    """
+    root = workshop.store.root
+    needed, free = MARGIN * forecast_bytes(workshop, plan, options, groups) - used_bytes(root), free_bytes(root)
+    if free < needed:
         raise OSError(
             errno.ENOSPC,
-            f"this run needs about {needed * MARGIN / 1e9:.1f} GB under {workshop.store.root}, but {free / 1e9:.1f} GB "
-            "are free; choose another --out, fewer --frames, or set motion.keep_flow=false",
+            f"this run needs about {size_text(needed)} more under {root}, but {size_text(free)} are free; "
+            "free some, or choose another --out, fewer --frames, or motion.keep_flow=false",
         )
 
 
@@ -56,7 +58,3 @@ def _fitted(width: int, height: int, options: PictureOptions) -> tuple[int, int]
     if options.max_width is None or width <= options.max_width:
         return width, height
     return options.max_width, round(height * options.max_width / width)
-
-
-def _existing(path: Path) -> Path:
-    return path if path.exists() else _existing(path.parent)

@@ -109,8 +109,9 @@ class Sequence:
 
     def _calibrate(self) -> None:
         groups, plan = self.made.only("sync"), self.plan
-        rig = self._make(find_rig(self.workshop, plan, groups, self.options.rig))
-        take = Take(groups=groups, rig=rig, cameras=tuple(plan.videos), first=plan.first)
+        rig = self._make(find_rig(self.workshop, plan, groups, self.options.pictures, self.options.rig))
+        pictures = self.options.pictures.as_filmed
+        take = Take(groups=groups, rig=rig, cameras=tuple(plan.videos), first=plan.first, pictures=pictures)
         self._make(FindPoints(take=take, fitted=plan.fitted, options=self.options.points))
 
     def _track(self) -> None:

@@ -9,10 +9,11 @@ LABEL_WIDTH = 30
 
 def ending(event: Event) -> str:
     """The line that remains of a stage."""
-    return f"{event.label:<{LABEL_WIDTH}} {_outcome(event)}"
+    return f"{event.label:<{LABEL_WIDTH}} {outcome(event)}"
 
 
-def _outcome(event: Event) -> str:
+def outcome(event: Event) -> str:
+    """How the stage ended."""
     match event.outcome:
         case "made":
             return duration(event.seconds)

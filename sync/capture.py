@@ -22,6 +22,8 @@ SHARED_TIMECODES = "timestamps.csv"
 SETTINGS = "capture.toml"
 SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
+TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10")
+"""Values of `transfer` in capture.toml; what they mean is packuv's, see `packuv.footage.transfer`."""
 SIDECAR_SUFFIXES = frozenset(
     {".aac", ".csv", ".db", ".ini", ".jpeg", ".jpg", ".json", ".log", ".lrv", ".m4a", ".md", ".mp3", ".pdf", ".png"}
     | {".srt", ".thm", ".toml", ".txt", ".wav", ".xml", ".yaml", ".yml"}
@@ -53,6 +55,8 @@ class CaptureSettings:
     """Where the calibration is, relative to the capture, or 'solve'; None looks into calibration/"""
     timecode_column: str | None = None
     """Time column of the CSV or JSON timecodes, where there are several"""
+    transfer: str | None = None
+    """One of TRANSFERS: what the code values of all videos mean; None leaves it to their tags"""
 
     @classmethod
     def read(cls, path: Path) -> CaptureSettings:
@@ -295,6 +299,9 @@ def _checked(path: Path, key: str, value: Any) -> Any:
             return ClockMode(value)
     except ValueError as error:
         raise ValueError(f"{path}: {key}: {error}; clocks are {[str(mode) for mode in ClockMode]}") from None
+    if key == "transfer" and value not in TRANSFERS:
+        close = _suggest(str(value), TRANSFERS)
+        raise ValueError(f"{path}: transfer must be one of {', '.join(TRANSFERS)}, but is {value!r}{close}")
     many = key in ("tags", "held_out", "ignore")
     texts = value if many else [value]
     if not isinstance(texts, list) or not all(isinstance(text, str) and text for text in texts):

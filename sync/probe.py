@@ -24,6 +24,43 @@ LONGEST_LOSS_S = Fraction(1, 2)
 """A file may end this much before its header says: the last frame's own duration is often wrong."""
 
 
+MATRICES = {0: "gbr", 1: "bt709", 4: "fcc", 5: "bt470bg", 6: "smpte170m", 7: "smpte240m", 8: "ycgco", 9: "bt2020nc"}
+MATRICES |= {10: "bt2020c", 14: "ictcp"}
+TRANSFER_CURVES = {1: "bt709", 4: "gamma22", 5: "gamma28", 6: "smpte170m", 7: "smpte240m", 8: "linear", 9: "log100"}
+TRANSFER_CURVES |= {11: "iec61966-2-4", 13: "iec61966-2-1", 14: "bt2020-10", 15: "bt2020-12", 16: "smpte2084"}
+TRANSFER_CURVES |= {17: "smpte428", 18: "arib-std-b67"}
+PRIMARIES = {1: "bt709", 4: "bt470m", 5: "bt470bg", 6: "smpte170m", 7: "smpte240m", 8: "film", 9: "bt2020"}
+PRIMARIES |= {10: "smpte428", 11: "smpte431", 12: "smpte432", 22: "ebu3213"}
+RANGES = {1: "limited", 2: "full"}
+"""FFmpeg's names for the codes of ITU-T H.273; those that say nothing have none"""
+
+
+@dataclass(frozen=True)
+class ColourTags:
+    """How a stream says that it codes colour, in FFmpeg's words; None where it does not say."""
+
+    pixel_format: str | None
+    bit_depth: int | None
+    """Bits per channel"""
+    matrix: str | None
+    transfer: str | None
+    primaries: str | None
+    range: str | None
+    """limited or full"""
+
+    @classmethod
+    def of(cls, context: av.VideoCodecContext) -> ColourTags:
+        form = context.format
+        return cls(
+            pixel_format=form.name if form else None,
+            bit_depth=max(component.bits for component in form.components) if form else None,
+            matrix=MATRICES.get(int(context.colorspace)),
+            transfer=TRANSFER_CURVES.get(int(context.color_trc)),
+            primaries=PRIMARIES.get(int(context.color_primaries)),
+            range=RANGES.get(int(context.color_range)),
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class VideoInfo:
     """One video stream."""
@@ -41,6 +78,7 @@ class VideoInfo:
     duration_ns: int
     """From the first frame to the end of the last"""
     size_bytes: int
+    colour: ColourTags
     start_label: str | None = None
     """SMPTE label of the first frame, where the container has one"""
 
@@ -118,6 +156,7 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         pts_ns=pts_ns,
         duration_ns=int(pts_ns[-1] - pts_ns[0]) + gap,
         size_bytes=path.stat().st_size,
+        colour=ColourTags.of(stream.codec_context),
         start_label=_start_label(container, stream, rate),
     )
 

@@ -24,7 +24,8 @@ from tasks.artefacts.store import Key
 RETRIES = 2
 BACKOFF_SECONDS = 2
 LASTING = frozenset(
-    {errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.ENOSPC, errno.EROFS, errno.EDQUOT}
+    {errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG}
+    | {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 )
 """Errors of the system that stay until somebody does something"""
 

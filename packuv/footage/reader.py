@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
 
 import av
 import numpy as np
+
+from packuv.footage.coding import Coding
+from packuv.footage.exact import ExactDecoder
+from packuv.footage.transfer import Transfer
 
 if TYPE_CHECKING:
     from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
@@ -21,27 +27,41 @@ class FrameReader:
     Each camera keeps its decoder and its place in the stream, so frames read in ascending order never seek, whatever
     the other cameras do in between (27 cameras in turn: 3.8 ms of CPU a frame at 640x360, as fast as one pass by PyAV).
     A step back, or past the next key frame, seeks. Safe to use from several threads.
+
+    Every picture is display-referred sRGB, whatever its video holds: more than 8 bits are rounded once, at the end, and
+    log curves become light before (`packuv.footage.transfer`). torchcodec decodes what it shows as it is meant,
+    8-bit video with its matrix named; PyAV decodes the rest, whose planes we convert.
     """
 
-    def __init__(self, videos: Mapping[str, Path], *, threads: int = 1, open_limit: int = 128) -> None:
-        """`threads` decode one camera; beyond `open_limit` open decoders the longest unused one is closed.
+    def __init__(
+        self,
+        videos: Mapping[str, Path],
+        *,
+        transfer: Transfer | None = None,
+        threads: int = 1,
+        open_limit: int = 128,
+    ) -> None:
+        """`transfer` is what code values mean; None leaves it to the tags: HLG, PQ, or else a finished picture.
+
+        `threads` decode one camera; beyond `open_limit` open decoders the longest unused one is closed.
 
         Keep the limit above the number of cameras: opening a decoder again scans its whole file.
         """
         if open_limit < 1 or threads < 1:
             raise ValueError(f"threads and open_limit must be at least 1, but are {threads} and {open_limit}")
         self.videos = {name: Path(path) for name, path in videos.items()}
+        self.transfer = transfer
         self._threads = threads
         self._open_limit = open_limit
-        self._decoders: OrderedDict[str, VideoDecoder] = OrderedDict()
-        self._timestamps: dict[str, np.ndarray] = {}
+        self._decoders: OrderedDict[str, TorchDecoder | ExactDecoder] = OrderedDict()
+        self._found: dict[str, Packets] = {}
         self._guard = Lock()
         self._locks = {name: Lock() for name in self.videos}
 
     def frame_count(self, camera: str) -> int:
         """Frames that the container's packets hold; the header's word is not taken."""
         with self._lock(camera):
-            return len(self._times(camera))
+            return len(self._packets(camera).ticks)
 
     def check_count(self, camera: str, expected: int) -> None:
         """Raise ValueError unless the video has `expected` frames, one per timecode."""
@@ -79,38 +99,38 @@ class FrameReader:
             raise ValueError(f"no video of camera {camera!r}; there are {sorted(self.videos)}")
         return self._locks[camera]
 
-    def _times(self, camera: str) -> np.ndarray:
-        if camera not in self._timestamps:
-            self._timestamps[camera] = packet_seconds(self.videos[camera])
-        return self._timestamps[camera]
+    def _packets(self, camera: str) -> Packets:
+        if camera not in self._found:
+            self._found[camera] = Packets.read(self.videos[camera])
+        return self._found[camera]
 
     def _read(self, camera: str, frame: int) -> np.ndarray:
-        times, path = self._times(camera), self.videos[camera]
-        if not 0 <= frame < len(times):
-            raise ValueError(f"{path} has frames 0 to {len(times) - 1}, but frame {frame} is asked for")
+        packets, path = self._packets(camera), self.videos[camera]
+        if not 0 <= frame < len(packets.ticks):
+            raise ValueError(f"{path} has frames 0 to {len(packets.ticks) - 1}, but frame {frame} is asked for")
         try:
-            decoded = self._decoder(camera).get_frame_at(frame)
-        except (RuntimeError, IndexError, ValueError) as error:
+            pixels, seconds = self._decoder(camera).read(frame)
+        except (RuntimeError, IndexError, ValueError, av.FFmpegError) as error:
             reason = f"cannot be decoded ({_first_line(error)})"
             raise ValueError(f"{path}: frame {frame} {reason}; {_remux_advice(path)}") from error
         # Half a microsecond: far below any frame time, far above float64 rounding of seconds.
-        if abs(decoded.pts_seconds - times[frame]) > 5e-7:
+        expected = packets.ticks[frame] * float(packets.base)
+        if abs(seconds - expected) > 5e-7:
             raise ValueError(
-                f"{path}: frame {frame} should be shown at {times[frame]:.6f} s, but the decoder returned the "
-                f"picture of {decoded.pts_seconds:.6f} s; {_remux_advice(path)}"
+                f"{path}: frame {frame} should be shown at {expected:.6f} s, but the decoder returned the "
+                f"picture of {seconds:.6f} s; {_remux_advice(path)}"
             )
-        return decoded.data.numpy()
+        return pixels
 
-    def _decoder(self, camera: str) -> VideoDecoder:
+    def _decoder(self, camera: str) -> TorchDecoder | ExactDecoder:
         with self._guard:
             decoder = self._decoders.pop(camera, None)
         if decoder is None:
-            # Here, since it takes seconds, and torch; many processes read no video.
-            from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
-
-            decoder = VideoDecoder(
-                str(self.videos[camera]), dimension_order="NHWC", num_ffmpeg_threads=self._threads, seek_mode="exact"
-            )
+            path, packets = self.videos[camera], self._packets(camera)
+            if packets.coding.plain(self.transfer):
+                decoder = TorchDecoder(path, threads=self._threads)
+            else:
+                decoder = ExactDecoder(path, packets.ticks, packets.keys, said=self.transfer, threads=self._threads)
         with self._guard:
             self._decoders[camera] = decoder
             while len(self._decoders) > self._open_limit:
@@ -118,21 +138,67 @@ class FrameReader:
         return decoder
 
 
+class TorchDecoder:
+    """One open video that FFmpeg's own conversion shows as it is meant, see `Coding.plain`."""
+
+    def __init__(self, path: Path, *, threads: int) -> None:
+        # Here, since it takes seconds, and torch; many processes read no video.
+        from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
+
+        self._decoder: VideoDecoder = VideoDecoder(
+            str(path), dimension_order="NHWC", num_ffmpeg_threads=threads, seek_mode="exact"
+        )
+
+    def read(self, frame: int) -> tuple[np.ndarray, float]:
+        """A picture, uint8 [H, W, 3], and when it is shown, seconds."""
+        decoded = self._decoder.get_frame_at(frame)
+        return decoded.data.numpy(), decoded.pts_seconds
+
+
+@dataclass(frozen=True, eq=False)
+class Packets:
+    """What demuxing alone tells of a video."""
+
+    ticks: np.ndarray
+    """int64 [n], ascending: when each frame is shown"""
+    base: Fraction
+    """Seconds of a tick"""
+    keys: np.ndarray
+    """int64, ascending: numbers of the key frames"""
+    coding: Coding
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """float64 [n], seconds, ascending."""
+        return self.ticks * float(self.base)
+
+    @classmethod
+    def read(cls, path: Path) -> Packets:
+        """Raises FileNotFoundError for a missing file, ValueError for one that is no video with a time per frame."""
+        if not path.is_file():
+            raise FileNotFoundError(f"no video at {path}")
+        try:
+            with av.open(str(path)) as container:
+                stream = container.streams.video[0]
+                # Packets that an edit list cuts away are marked for discarding; no decoder shows them.
+                times = [
+                    (packet.pts, packet.is_keyframe)
+                    for packet in container.demux(stream)
+                    if packet.pts is not None and packet.size and not packet.is_discard
+                ]
+                base, coding = stream.time_base, Coding.of(stream)
+        except (av.FFmpegError, IndexError, ValueError) as error:
+            raise ValueError(f"{path} cannot be read as a video ({_first_line(error)}); export it again") from error
+        if not times or base is None:
+            raise ValueError(f"{path} holds no timed video frames; remux it (ffmpeg -i {path.name} -c copy out.mkv)")
+        times.sort()
+        ticks, keys = np.array(times, dtype=np.int64).T
+        return cls(np.ascontiguousarray(ticks), base, np.flatnonzero(keys), coding)
+
+
 def packet_seconds(path: Path) -> np.ndarray:
     """When each frame of a video is shown, by demuxing alone: float64 [n], seconds, ascending."""
-    if not path.is_file():
-        raise FileNotFoundError(f"no video at {path}")
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            # Packets that an edit list cuts away are marked for discarding; no decoder shows them.
-            ticks = [p.pts for p in container.demux(stream) if p.pts is not None and p.size and not p.is_discard]
-            base = stream.time_base
-    except (av.FFmpegError, IndexError) as error:
-        raise ValueError(f"{path} cannot be read as a video ({_first_line(error)}); export it again") from error
-    if not ticks or base is None:
-        raise ValueError(f"{path} holds no timed video frames; remux it (ffmpeg -i {path.name} -c copy out.mkv)")
-    return np.sort(np.array(ticks, dtype=np.int64)) * float(base)
+    return Packets.read(path).seconds
 
 
 def _remux_advice(path: Path) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera, gain_table, undistorted_camera, undistortion_maps
 from packuv.footage.reader import FrameReader
+from packuv.footage.transfer import Transfer
 
 
 class Views:
@@ -39,12 +40,14 @@ class Views:
         lenses: Sequence[LensCamera],
         *,
         max_width: int | None = None,
+        transfer: Transfer | None = None,
         cache_bytes: int = 1 << 30,
         reader: FrameReader | None = None,
     ) -> None:
         """`frames` is int [T, C]: frame number in the video of camera c at instant t, -1 where it has none.
 
-        Pictures wider than `max_width` are scaled down to it. `reader` is shared with others if given.
+        Pictures wider than `max_width` are scaled down to it. `transfer` is what the code values of all videos mean,
+        None what each is tagged with. `reader`, which has its own, is shared with others if given.
         Raises ValueError where shapes disagree, a camera has no video, or a lens cannot be undistorted.
         """
         names = [lens.pinhole.name for lens in lenses]
@@ -55,7 +58,8 @@ class Views:
         self.lenses = tuple(lenses)
         self.frames = frames.astype(np.int32)
         self.max_width = max_width
-        self.reader = reader or FrameReader({name: Path(videos[name]) for name in names})
+        self.transfer = transfer
+        self.reader = reader or FrameReader({name: Path(videos[name]) for name in names}, transfer=transfer)
         self._videos = {name: Path(videos[name]) for name in names}
         undistorted = [undistorted_camera(lens) for lens in lenses]
         self._maps = [undistortion_maps(lens, camera) for lens, camera in zip(lenses, undistorted, strict=True)]
@@ -109,6 +113,7 @@ class Views:
             "cameras": [lens.to_json() for lens in self.lenses],
             "frames": _packed(self.frames),
             "max_width": self.max_width,
+            "transfer": self.transfer,
         }
 
     @classmethod
@@ -117,7 +122,8 @@ class Views:
         lenses = [LensCamera.from_json(item) for item in spec["cameras"]]
         frames = _unpacked(spec["frames"], len(lenses))
         videos = {name: Path(path) for name, path in spec["videos"].items()}
-        return cls(videos, frames, lenses, max_width=spec["max_width"])
+        transfer = Transfer(spec["transfer"]) if spec["transfer"] else None
+        return cls(videos, frames, lenses, max_width=spec["max_width"], transfer=transfer)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (Views.from_spec, (self.to_spec(),))

@@ -12,14 +12,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from pipelines.commands.terminal import size_text
+from pipelines.commands.output import answer
+from pipelines.disk import size_text
 
 
 def doctor(arguments: argparse.Namespace) -> int:
     """`packuv doctor`: exit code 1 if something is missing that every run needs."""
     found = list(_examine())
     for name, state, needed in found:
-        print(f"{'ok' if state[0] else 'MISSING' if needed else 'absent':<8} {name:<12} {state[1]}")
+        answer(f"{'ok' if state[0] else 'MISSING' if needed else 'absent':<8} {name:<12} {state[1]}")
     return 0 if all(state[0] or not needed for _, state, needed in found) else 1
 
 

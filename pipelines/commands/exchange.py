@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.commands.frames import check_frame, frames_of
-from pipelines.commands.terminal import print_facts, shown, size_text
+from pipelines.commands.terminal import print_facts, shown
+from pipelines.disk import size_text
 
 if TYPE_CHECKING:
     from calibration.rig import Rig

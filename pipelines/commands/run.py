@@ -10,9 +10,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.commands.output import answer
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
-from pipelines.request import RunRequest, read_settings
+from pipelines.request import STAGES, RunRequest, read_settings
 from pipelines.server import workflow_server
 from sync.capture import CaptureSettings
 
@@ -26,7 +27,11 @@ def command(arguments: argparse.Namespace) -> int:
     progress = TerminalProgress(sys.stderr if arguments.json else sys.stdout)
     with contextlib.closing(progress):
         outcome = run(request, Journal(progress), direct=arguments.direct)
-    print(json.dumps(outcome.to_json(), indent=1) if arguments.json else outcome.farewell())
+    if request.stop_after == STAGES[-1]:
+        from pipelines.results import check_whole  # takes seconds, as what runs
+
+        check_whole(outcome.folder)
+    answer(json.dumps(outcome.to_json(), indent=1)) if arguments.json else print(outcome.farewell())
     return 0
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.commands.frames import frames_of
-from pipelines.commands.terminal import print_facts, shown, size_text
+from pipelines.commands.terminal import print_facts, shown
+from pipelines.disk import size_text
 from pipelines.request import read_settings
 from tasks.artefacts.recipe import override
 from tasks.artefacts.store import find_stores

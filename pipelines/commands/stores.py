@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pipelines.commands.terminal import print_facts, size_text
+from pipelines.commands.terminal import print_facts
+from pipelines.disk import size_text
 from tasks.artefacts.retention import REMAKEABLE, Cleaned, Cleaning, Item, Policy, State, Why, clean_folder
 from tasks.artefacts.store import find_stores
 

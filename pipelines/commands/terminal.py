@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from packuv.progress import Progress
+from pipelines.commands.output import answer
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
 
@@ -31,16 +32,8 @@ def shown(arguments: argparse.Namespace, label: str) -> Iterator[Progress]:
 
 
 def print_facts(facts: Mapping[str, Any], as_json: bool, text: Callable[[Mapping[str, Any]], str]) -> None:
-    print(json.dumps(facts, indent=1) if as_json else text(facts))
-
-
-def size_text(count: float) -> str:
-    """Bytes for people, decimal units."""
-    for unit in ("B", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.3g} {unit}" if unit != "B" else f"{count:.0f} B"
-        count /= 1000
-    return f"{count:,.1f} GB"
+    """The answer of a command."""
+    answer(json.dumps(facts, indent=1) if as_json else text(facts))
 
 
 def print_table(table: Table) -> None:

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import json
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -40,6 +42,8 @@ RAISED_AS = (FileNotFoundError, NotADirectoryError, PermissionError, OSError, Va
 """Kinds of exception that keep their kind on the way out of a job, the particular before the general"""
 PR_SET_PDEATHSIG = 1
 JOB_FILE = "job.pickle"
+FULL_BYTES = 1_000_000
+"""Where less is free, a full disk is taken for the cause of what went wrong without saying why"""
 MARK = "PACKUV_JOB"
 """Environment variable of a job and all that it starts: the folder it works for"""
 
@@ -158,11 +162,15 @@ class Jobs:
     def _outcome(self, last: Mapping[str, Any] | None, code: int, job: Job, log: Path) -> Done:
         self.check()
         if last is None:
+            _blame_disk(log.parent)
             raise JobDiedError(
                 f"the job {job} ended without a result ({_described(code)}); its output is in {log}", log
             )
         if "error" in last:
-            raise _exception(last["error"], log)
+            raised = _exception(last["error"], log)
+            if isinstance(raised, JobError) or (type(raised) is OSError and not raised.errno):
+                _blame_disk(log.parent)
+            raise raised
         return Done(last["result"], last["peak_memory_bytes"], last["cpu"])
 
 
@@ -203,12 +211,18 @@ def _described(code: int) -> str:
     return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
 
 
+def _blame_disk(folder: Path) -> None:
+    """Raise OSError (no space) where the disk is full: libraries hide it, and a mapped file dies of it by SIGBUS."""
+    if shutil.disk_usage(folder).free < FULL_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
 def _exception(error: Mapping[str, Any], log: Path) -> Exception:
     for kind in RAISED_AS:
         if kind.__name__ in error["kinds"]:
             raised = kind(error["message"])
             if isinstance(raised, OSError):
-                raised.errno = error["errno"]
+                raised.errno, raised.strerror, raised.filename = error["errno"], error["strerror"], error["filename"]
             raised.add_note(f"the job's own traceback is in {log}")
             return raised
     return JobError(f"{error['kinds'][0]}: {error['message']}; the traceback is in {log}", log)
@@ -258,9 +272,20 @@ def _result(job: Path, progress: Progress) -> dict[str, Any]:
             "cpu": cpu_description(),
         }
     except Exception as error:
-        traceback.print_exc()
-        kinds = [kind.__name__ for kind in type(error).__mro__]
-        return {"error": {"kinds": kinds, "message": _message(error), "errno": getattr(error, "errno", None)}}
+        with contextlib.suppress(OSError):  # a full disk has no room for the log either
+            traceback.print_exc()
+        return {"error": _told(error)}
+
+
+def _told(error: Exception) -> dict[str, Any]:
+    system = error if isinstance(error, OSError) else OSError()
+    return {
+        "kinds": [kind.__name__ for kind in type(error).__mro__],
+        "message": _message(error),
+        "errno": system.errno,
+        "strerror": system.strerror,
+        "filename": None if system.filename is None else str(system.filename),
+    }
 
 
 def _message(error: Exception) -> str:

@@ -5,12 +5,13 @@ The text of a recipe is hashed, so equal recipes must have equal texts and diffe
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
 import os
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass, replace
 from enum import Enum
 from fractions import Fraction
@@ -238,5 +239,20 @@ def _described(kind: Any) -> str:
 def write_json(path: Path, value: Any) -> None:
     """Replace a JSON file in one step; a reader sees the old text or the new one."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_text(json.dumps(recipe.plain(value), indent=1))
-    os.replace(part, path)
+    try:
+        with naming(path):
+            part.write_text(json.dumps(recipe.plain(value), indent=1))
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Where an error of the system names no file, as one in writing does not, have it name this file or folder."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and error.filename is None:
+            error.filename = str(path)
+        raise

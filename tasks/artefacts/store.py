@@ -25,7 +25,7 @@ from typing import Any, BinaryIO
 
 from tasks.artefacts import recipe
 from tasks.artefacts.digests import file_digest
-from tasks.artefacts.recipe import write_json
+from tasks.artefacts.recipe import naming, write_json
 
 RECEIPT = "receipt.json"
 WORK, OUT = ".work", "out"
@@ -173,7 +173,7 @@ class Store:
         what = _recipe(stage, version, options, inputs)
         key = Key(stage, recipe.digest(what))
         if not self.holds(key):
-            with self._locked(key, waiting) as lock:
+            with self._locked(key, waiting) as lock, naming(self.work_folder(key)):
                 if not self.holds(key):
                     self._build(key, what, build, originals, lock)
                     return key

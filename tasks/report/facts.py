@@ -155,6 +155,10 @@ class ReportInput:
     held_out: tuple[str, ...] = ()
     """Cameras that were never fitted"""
     check: RigReport | None = None
+    colours: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """By camera: how its video says that it codes colour, see `sync.probe.ColourTags`"""
+    log_like: tuple[str, ...] = ()
+    """Cameras whose pictures look like log footage that nobody called so"""
     motion: MotionCurve | None = None
     scores: tuple[FrameScore, ...] = ()
     """Of held-out cameras; of fitted ones where none was held out"""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -79,10 +80,29 @@ def _sync_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
 def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
     if report.check is not None:
         yield from (Finding("rig", f"{camera}: {what}.") for camera, what in report.check.suspicious.items())
+    yield from _colour_findings(report)
     for camera in report.rig.cameras if report.rig else ():
         worst = max(camera.gains, key=lambda gain: abs(math.log(gain)))
         if not 1 / limits.gain <= worst <= limits.gain:
             yield Finding("colour", f"{camera.name} needs a colour gain of {worst:.2f}.")
+
+
+def _colour_findings(report: ReportInput) -> Iterator[Finding]:
+    """Cameras whose videos code colour otherwise than most do, or look like log footage that nobody called so."""
+    codings = {camera: tuple(tags.items()) for camera, tags in report.colours.items()}
+    usual = dict(Counter(codings.values()).most_common(1)[0][0]) if codings else {}
+    for camera, tags in report.colours.items():
+        differing = [
+            f"{name.replace('_', ' ')} {tags[name]}, not {usual[name]}" for name in usual if tags[name] != usual[name]
+        ]
+        if differing:
+            said = "; ".join(differing).replace("None", "untold")
+            yield Finding("colour", f"The video of {camera} is coded otherwise than most: {said}.")
+    if report.log_like:
+        names, verb = ", ".join(report.log_like), "looks" if len(report.log_like) == 1 else "look"
+        yield Finding(
+            "colour", f'{names} {verb} like log footage; say which in capture.toml, such as transfer = "slog3".'
+        )
 
 
 def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from tasks.artefacts.recipe import write_json
+from packuv.files import whole_file
+from tasks.artefacts.recipe import naming, write_json
 from tasks.report.facts import (
     Comparison,
     FrameScore,
@@ -61,7 +61,6 @@ def write_report(report: ReportInput, folder: Path, *, limits: Limits = LIMITS) 
     files = ReportFiles(folder / JSON_NAME, folder / PAGE_NAME)
     text = page_text(report, limits)
     write_json(files.json, report_json(report, limits))
-    partial = files.page.with_name(f".{PAGE_NAME}.{os.getpid()}.part")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, files.page)
+    with whole_file(files.page) as partial, naming(files.page):
+        partial.write_text(text, encoding="utf-8")
     return files

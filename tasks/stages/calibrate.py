@@ -23,7 +23,7 @@ from sync.capture import Capture, find_capture
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.footage import RIG, Footage, Take
+from tasks.stages.footage import RIG, Footage, PictureOptions, Take
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import read_videos
 
@@ -126,9 +126,11 @@ class SolveRig(Stage):
         return {"source": "COLMAP", "verdict": rig.source}
 
 
-def find_rig(workshop: Workshop, plan: Plan, groups: Key, options: RigOptions) -> ImportRig | SolveRig:
+def find_rig(
+    workshop: Workshop, plan: Plan, groups: Key, pictures: PictureOptions, options: RigOptions
+) -> ImportRig | SolveRig:
     """The stage for a capture with a calibration, or for one without."""
-    take = Take(groups=groups, cameras=tuple(plan.videos))
+    take = Take(groups=groups, cameras=tuple(plan.videos), pictures=pictures.as_filmed)
     source = workshop.capture.calibration
     if source is None:
         return SolveRig(take=take, first=plan.first, options=options)
@@ -151,11 +153,11 @@ class FindPoints(Stage):
 
     def build(self, work: Work) -> Notes:
         footage, options = Footage(self.take, work.site), self.options
-        rig = footage.load_rig()
+        rig, watch = footage.load_rig(), footage.watch_for_log()
         count = len(footage.load_groups().times_ns)
         chosen = [0, *(instant for instant in options.more_instants if 0 < instant < count)]
         shown = (
-            {name: picture for name, picture in footage.filmed(instant).items() if name in self.fitted}
+            {name: picture for name, picture in watch.passing(footage.filmed(instant)).items() if name in self.fitted}
             for instant in chosen
         )
         work.progress(0, 1, "matching features")
@@ -163,12 +165,18 @@ class FindPoints(Stage):
             points = triangulate(rig.select(self.fitted), shown, options=options.triangulate)
         except ValueError as problem:  # the rig was judged before: it is the scene that shows too little
             rig.save(work.out / RIG)
-            return {"points": 0, "balanced": False, "reason": str(problem)}
+            return {"points": 0, "balanced": False, "reason": str(problem), "log_like": watch.suspects}
         report = balance(points, options=options.balance)
         points.save(work.out / POINTS)
         with_gains(rig, report).save(work.out / RIG)
         save_json(work.out / COLOUR, without_nan(report.to_json()))
-        return {"points": len(points.xyz), "balanced": report.kept, "reason": report.reason, **_figures(points)}
+        notes = {
+            "points": len(points.xyz),
+            "balanced": report.kept,
+            "reason": report.reason,
+            "log_like": watch.suspects,
+        }
+        return {**notes, **_figures(points)}
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         if not notes["points"]:

@@ -95,7 +95,7 @@ class Verify(Stage):
 def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState) -> SceneHeader:
     """What the scene says about its capture. No path and no clock time goes in: same input, same bytes."""
     groups = footage.site.path(footage.take.groups)
-    rig, report = footage.load_rig(), SyncReport.load(groups)
+    rig, report, transfer = footage.load_rig(), SyncReport.load(groups), footage.take.pictures.transfer
     return SceneHeader(
         quantizer=key.quantizer,
         times_ns=np.ascontiguousarray(footage.load_groups().times_ns),
@@ -116,6 +116,8 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState) -> 
             "metric": rig.metric,
             "max_width": footage.take.pictures.max_width,
             "lenses": [lens_camera(camera).to_json() for camera in rig.cameras],
+            # Absent where tags decide, so that scenes of such captures keep their bytes.
+            **({"transfer": str(transfer)} if transfer else {}),
         },
     )
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from packuv.files import save_json
-from packuv.footage import LensCamera, Views
+from packuv.footage import LensCamera, Transfer, Views
 from packuv.progress import Progress
 from packuv.scene import open_scene
 from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
@@ -85,8 +85,14 @@ def evaluate_scene(
         rows = _rows(groups, header.times_ns)
         columns = [groups.cameras.index(name) for name in names]
         frames = groups.frames[rows][:, columns]
-        width = header.extra["max_width"]
-        views = Views(find_capture(capture).videos, frames, [lenses[name] for name in names], max_width=width)
+        said = header.extra.get("transfer")
+        views = Views(
+            find_capture(capture).videos,
+            frames,
+            [lenses[name] for name in names],
+            max_width=header.extra["max_width"],
+            transfer=Transfer(said) if said else None,
+        )
         scores = score(opened, views, progress)
         return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
 

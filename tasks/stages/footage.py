@@ -3,33 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from calibration.rig import Camera, Rig
 from packuv.camera import PinholeCamera
-from packuv.footage import FrameReader, LensCamera, Views
+from packuv.footage import FrameReader, LensCamera, Transfer, Views, looks_like_log
 from sync.align import FrameGroups
 from sync.capture import find_capture
 from tasks.artefacts.stage import Site
 from tasks.artefacts.store import Key
-from tasks.stages.synchronize import selected
+from tasks.stages.synchronize import read_videos, selected
 
 RIG = "rig.json"
 """Name of the rig's file in artefacts"""
+HDR_TAGS = ("arib-std-b67", "smpte2084")
+"""Tags of videos that say what their code values mean, HLG and PQ"""
 
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """Size of the pictures that are tracked, fitted and scored."""
+    """Size of the pictures that are tracked, fitted and scored, and how their code values are read."""
 
     max_width: int | None = None
     """Wider pictures are scaled down to this, pixels; none keeps them as filmed"""
+    transfer: Transfer | None = None
+    """What the code values of all videos mean; none: HLG and PQ where a video is tagged so, else a finished picture"""
 
     def __post_init__(self) -> None:
         if self.max_width is not None and self.max_width < 16:
             raise ValueError(f"max_width must be at least 16 pixels, but is {self.max_width}")
+
+    @property
+    def as_filmed(self) -> PictureOptions:
+        """The same pictures in their full size."""
+        return replace(self, max_width=None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,15 +86,43 @@ class Footage:
         videos = find_capture(self.site.capture).videos
         lenses = [lens_camera(rig[name]) for name in names]
         frames = np.ascontiguousarray(groups.frames[:, columns])
-        return Views(videos, frames, lenses, max_width=self.take.pictures.max_width)
+        pictures = self.take.pictures
+        return Views(videos, frames, lenses, max_width=pictures.max_width, transfer=pictures.transfer)
 
     def filmed(self, instant: int) -> dict[str, np.ndarray]:
         """Pictures as filmed, uint8 [H, W, 3] RGB, of the cameras that have one at this instant of the take."""
         groups, videos = self.load_groups(), find_capture(self.site.capture).videos
         names = self.take.cameras
-        reader = FrameReader({name: videos[name] for name in names})
+        reader = FrameReader({name: videos[name] for name in names}, transfer=self.take.pictures.transfer)
         numbers = {name: int(groups.frames[instant, groups.cameras.index(name)]) for name in names}
         return {name: reader.read(name, number) for name, number in numbers.items() if number >= 0}
+
+    def watch_for_log(self) -> LogWatch:
+        """Watches cameras that may have filmed log without saying so: more than 8 bits, no word on what they mean."""
+        videos = {} if self.take.pictures.transfer else read_videos(self.site.path(self.take.groups))
+        tags = {name: video["colour"] for name, video in videos.items()}
+        deep = (name for name, tag in tags.items() if (tag["bit_depth"] or 0) > 8 and tag["transfer"] not in HDR_TAGS)
+        return LogWatch(dict.fromkeys(deep, False))
+
+
+@dataclass
+class LogWatch:
+    """Looks at pictures on their way."""
+
+    flat: dict[str, bool]
+    """By watched camera: whether all of its pictures so far look like log footage"""
+    seen: set[str] = field(default_factory=set)
+
+    def passing(self, pictures: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The same pictures, as decoded."""
+        for name in self.flat.keys() & pictures.keys():
+            self.flat[name] = looks_like_log(pictures[name]) and (self.flat[name] or name not in self.seen)
+        self.seen.update(pictures)
+        return pictures
+
+    @property
+    def suspects(self) -> list[str]:
+        return [name for name, flat in self.flat.items() if flat]
 
 
 def lens_camera(camera: Camera) -> LensCamera:

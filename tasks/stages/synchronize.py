@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from tasks.artefacts.workshop import Workshop
 class Synchronize(Stage):
     """Match the frames of all cameras: sync.json, groups.arrow, videos.json and the AVL index of each camera."""
 
-    name, version = "sync", 2
+    name, version = "sync", 3
     videos: Files
     timecodes: Files
     fps: Fraction | None
@@ -77,7 +77,7 @@ def selected(groups: FrameGroups, first: int, stop: int | None) -> range:
 
 
 def read_videos(groups: Path) -> dict[str, dict[str, Any]]:
-    """What a sync artefact says about the video of each camera: width, height, codec, rate, frames, ..."""
+    """What a sync artefact says about the video of each camera: width, height, codec, rate, frames, colour, ..."""
     videos: dict[str, dict[str, Any]] = json.loads((groups / "videos.json").read_text())["videos"]
     return videos
 
@@ -107,4 +107,5 @@ def _info_to_json(info: VideoInfo) -> dict[str, Any]:
         "frames": info.frame_count,
         "duration_ns": info.duration_ns,
         "bytes": info.size_bytes,
+        "colour": asdict(info.colour),
     }

@@ -84,6 +84,9 @@ def test_help_imports_nothing_heavy():
     assert not {"numpy", "torch", "numba", "prefect", "av", "cv2", "pyarrow"} & set(modules)
 
 
+ROOM = r"/\S+: [\d.,]+ .?B are free; free some and run the same command again"
+
+
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
@@ -92,7 +95,13 @@ def test_help_imports_nothing_heavy():
         (PermissionError(13, "Permission denied", "runs"), WRONG, r"packuv: Permission denied: runs\n"),
         (KeyboardInterrupt(), INTERRUPTED, r"packuv: stopped; the same command goes on from here\n"),
         (TypeError("a bug\nin two lines"), FAILED, r"packuv: a bug in two lines; the traceback is in (\S+)\n"),
-        (OSError(28, "No space left on device"), FAILED, r"packuv: No space left on device\n"),
+        (OSError(28, "No space left on device"), FAILED, rf"packuv: No space left on device: {ROOM}\n"),
+        (OSError(122, "Disk quota exceeded", "a.mp4"), FAILED, rf"packuv: Disk quota exceeded: {ROOM}\n"),
+        (OSError(28, "Error writing: [errno 28]", "a"), FAILED, rf"packuv: No space left on device: {ROOM}\n"),
+        (OSError(28, "needs 9 MB, but 3 MB are free"), FAILED, r"packuv: needs 9 MB, but 3 MB are free\n"),
+        (OSError(30, "Read-only file system", "runs"), FAILED, r"packuv: Read-only file system: runs\n"),
+        (OSError(36, "File name too long", "runs"), WRONG, r"packuv: File name too long: runs\n"),
+        (BrokenPipeError(32, "Broken pipe"), FAILED, r"packuv: Broken pipe\n"),
         (OSError(5, "Input/output error", "a.mp4"), FAILED, r"packuv: Input/output error: a\.mp4\n"),
     ],
 )
@@ -109,6 +118,28 @@ def test_every_failure_is_one_line_and_a_code(error, code, message, capsys, monk
         log = next(tmp_path.iterdir())
         assert str(log) == found[1]
         assert "Traceback" in log.read_text()
+
+
+def test_a_full_disk_takes_no_traceback_either(capsys, monkeypatch):
+    def fails(arguments):
+        raise TypeError("a bug")
+
+    def full(*values, **settings):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cli, "_load", lambda name: fails)
+    monkeypatch.setattr(cli.tempfile, "NamedTemporaryFile", full)
+    assert main(["doctor"]) == FAILED
+    assert capsys.readouterr().err == "packuv: a bug; no place for the traceback: No space left on device\n"
+
+
+def test_a_full_disk_is_that_of_the_output_where_nothing_else_is_named(capsys, monkeypatch, tmp_path):
+    def fails(arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cli, "_load", lambda name: fails)
+    assert main(["sync", "capture", "--out", str(tmp_path / "runs")]) == FAILED
+    assert capsys.readouterr().err.startswith(f"packuv: No space left on device: {tmp_path / 'runs'}: ")
 
 
 def test_arguments_become_a_request(tmp_path):

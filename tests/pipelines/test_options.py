@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from packuv.footage import Transfer
 from packuv.scene import TOLERANCES, Quality, Tolerance
 from pipelines.options import SequenceOptions, compose
 from pipelines.request import PRESETS, RunRequest
@@ -33,6 +34,9 @@ def test_the_user_wins_over_the_capture_and_that_over_the_preset():
     assert (options.sync.reference, options.sync.clock, options.fit.seed) == ("cam03", ClockMode.TRIGGERED, 7)
     options = compose("draft", CAPTURE, {"sync": {"reference": "cam01"}, "fit": {"iterations": "12"}})
     assert (options.sync.reference, options.sync.clock, options.fit.iterations) == ("cam01", ClockMode.TRIGGERED, 12)
+    log = CaptureSettings(transfer="slog3")
+    assert compose("draft", log, {}).pictures.transfer is Transfer.SLOG3
+    assert compose("draft", log, {"pictures": {"transfer": "none"}}).pictures.transfer is None
     assert options.fit.key_iterations == compose("draft", CAPTURE, {}).fit.key_iterations
 
 

@@ -14,7 +14,7 @@ import sync.capture
 from sync.align import build_index, load_index, save_index
 from sync.capture import CaptureSettings, check_name, find_capture, load_timecodes
 from sync.clock import ClockMode
-from sync.probe import VideoInfo
+from sync.probe import ColourTags, VideoInfo
 from sync.timecode import Timecodes
 
 
@@ -28,9 +28,12 @@ def make_capture(folder: Path, *files: str, settings: str | None = None) -> Path
     return folder
 
 
+UNTAGGED = ColourTags("yuv420p", 8, None, None, None, None)
+
+
 def make_info(frames: int) -> VideoInfo:
     times = np.arange(frames, dtype=np.int64) * 40_000_000
-    return VideoInfo(64, 48, "h264", Fraction(25), frames, times, frames * 40_000_000, 1000)
+    return VideoInfo(64, 48, "h264", Fraction(25), frames, times, frames * 40_000_000, 1000, UNTAGGED)
 
 
 VIDEOS = ("videos/cam1.mp4", "videos/cam2.mkv", "videos/cam10.mov")
@@ -61,6 +64,7 @@ def test_settings_are_read(tmp_path: Path) -> None:
         clock = "triggered"
         calibration = "solve"
         timecode_column = "pts_ns"
+        transfer = "slog3"
     """
     files = (*VIDEOS, "videos/cam3.mp4", "calibration/transforms.json", "timecodes/cam1.txt", "timecodes/cam2.csv")
     capture = find_capture(make_capture(tmp_path, *files, settings=text))
@@ -74,6 +78,7 @@ def test_settings_are_read(tmp_path: Path) -> None:
     assert (settings.reference, settings.held_out, settings.ignore) == ("cam2", ("cam10",), ("cam1",))
     assert settings.clock is ClockMode.TRIGGERED
     assert settings.timecode_column == "pts_ns"
+    assert settings.transfer == "slog3"
 
 
 @pytest.mark.parametrize(
@@ -85,6 +90,7 @@ def test_settings_are_read(tmp_path: Path) -> None:
         ("fps = 'fast'", "fps: a frame rate is a number"),
         ("fps = 0", "fps: a frame rate lies between"),
         ("clock = 'sundial'", "clock: .*sundial"),
+        ("transfer = 'slog'", "transfer must be one of sdr, hlg, .*, but is 'slog'; did you mean 'slog3'"),
         ("name = 3", "name must be a text, but is 3"),
         ("tags = 'a'", "tags must be a list of texts"),
         ("ignore = [1]", "ignore must be a list of texts"),

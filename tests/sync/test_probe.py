@@ -7,8 +7,9 @@ import av
 import numpy as np
 import pytest
 
-from sync.probe import container_timecodes, probe_video
+from sync.probe import ColourTags, container_timecodes, probe_video
 from sync.timecode import frames_to_ns
+from tests.support.planes import shapes, write_planes
 
 RATE = Fraction(30)
 
@@ -86,6 +87,14 @@ def test_other_codecs(tmp_path: Path, codec: str, suffix: str) -> None:
     info = probe_video(make_video(tmp_path / f"cam.{suffix}", codec=codec))
     assert info.frame_count == 40
     assert info.rate == RATE
+
+
+def test_colour_is_told_as_the_stream_says(tmp_path: Path) -> None:
+    planes = [np.full(shape, 512, np.uint16) for shape in shapes("422", 48, 64)]
+    path = write_planes(tmp_path / "a.mkv", "yuv422p10le", [planes], (9, 1, 18, 9))
+    assert probe_video(path).colour == ColourTags("yuv422p10le", 10, "bt2020nc", "arib-std-b67", "bt2020", "limited")
+    path = write_planes(tmp_path / "b.mkv", "yuv422p10le", [planes])
+    assert probe_video(path).colour == ColourTags("yuv422p10le", 10, None, None, None, None)
 
 
 def test_times_are_exact_at_ntsc_rates(tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def _server_pids(parent: int) -> list[int]:
     return [int(pid) for pid in children]
 
 
-def test_server_dies_with_a_killed_run_and_its_database_is_free_again(tmp_path, monkeypatch):
+def test_server_dies_with_a_killed_run_and_its_folder_is_free_again(tmp_path, monkeypatch):
     for name in ("PREFECT_API_URL", "PREFECT_HOME"):  # the session's server may be running
         monkeypatch.delenv(name, raising=False)
     with subprocess.Popen(

@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -46,6 +47,9 @@ def area(progress, size: Size, names: tuple[str, ...], out: Path):
 def bad_input(progress): raise CaptureError("cam03 has no frames")
 def missing(progress): raise FileNotFoundError(2, "no such thing", "cam03.mp4")
 def full(progress): raise OSError(28, "No space left on device")
+def full_here(progress): raise OSError(28, "No space left on device", Path("/runs/a.npz"))
+def full_hidden(progress): raise RuntimeError("could not write")
+def full_mapped(progress): os.kill(os.getpid(), signal.SIGBUS)
 def bug(progress): return {}["key"]
 def dies(progress): os.kill(os.getpid(), signal.SIGKILL)
 def says(progress): print("said by the job"); sys.stdout.flush(); sys.exit(3)
@@ -142,6 +146,38 @@ def test_failures_keep_their_kind_and_words(jobs, work, tmp_path, function, kind
     assert isinstance(caught.value, JobDiedError) == (kind is JobDiedError)
     log = (tmp_path / "job.log").read_text()
     assert {"bug": "Traceback", "says": "said by the job"}.get(function, "") in log
+
+
+@pytest.mark.parametrize("function", ["full", "full_here", "bad_input"])
+def test_a_full_disk_takes_no_log_but_the_error_arrives(jobs, work, tmp_path, function):
+    (tmp_path / "job.log").symlink_to("/dev/full")
+    with pytest.raises((OSError, ValueError)) as caught:
+        jobs.run(getattr(work, function), folder=tmp_path)
+    if function != "bad_input":
+        error = caught.value
+        named = {"full_here": "/runs/a.npz"}.get(function)
+        assert (error.errno, error.strerror, error.filename) == (28, "No space left on device", named)
+
+
+@pytest.mark.parametrize(
+    ("function", "free", "kind"),
+    [
+        ("full_hidden", 0, OSError),
+        ("full_mapped", 0, OSError),
+        ("full_hidden", 10**9, JobError),
+        ("full_mapped", 10**9, JobDiedError),
+        ("bad_input", 0, ValueError),
+        ("missing", 0, FileNotFoundError),
+    ],
+)
+def test_what_gives_no_reason_on_a_full_disk_failed_of_that(jobs, work, tmp_path, monkeypatch, function, free, kind):
+    # What the system says of the disk is all that is not real here: a disk of one's own needs root.
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**12, 10**12 - free, free))
+    with pytest.raises(kind) as caught:
+        jobs.run(getattr(work, function), folder=tmp_path)
+    assert type(caught.value) is kind
+    if kind is OSError:
+        assert (caught.value.errno, caught.value.filename) == (28, str(tmp_path))
 
 
 def test_cancel_ends_jobs_and_what_they_started(jobs, work, tmp_path):

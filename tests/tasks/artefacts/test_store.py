@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tasks.artefacts.digests import FileDigests, file_digest
-from tasks.artefacts.recipe import OptionError, canonical, digest, plain, restore
+from tasks.artefacts.recipe import OptionError, canonical, digest, plain, restore, write_json
 from tasks.artefacts.store import RECEIPT, Building, Key, Store
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
@@ -201,6 +202,33 @@ def test_failed_build_publishes_nothing_and_keeps_its_scratch(tmp_path):
     assert sorted(path.name for path in store.path(key).iterdir()) == [RECEIPT, "whole.txt"]
     assert (store.path(key) / "whole.txt").read_text() == "frame 7"
     assert not store.work_folder(key).exists()
+
+
+def test_an_error_of_the_system_names_a_place(tmp_path):
+    store = Store(tmp_path)
+
+    def build(building: Building) -> None:
+        with open("/dev/full", "w") as file:  # writing fails without a name
+            file.write("x")
+
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        store.make("a", 1, {}, {}, build)
+    assert caught.value.filename == str(store.work_folder(store.key("a", 1, {}, {})))
+    assert list(store.keys()) == []
+
+
+def test_json_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    write_json(tmp_path / "run.json", {"a": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            write_json(tmp_path / "run.json", {"a": "b" * 200})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert caught.value.filename == str(tmp_path / "run.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+    assert json.loads((tmp_path / "run.json").read_text()) == {"a": 1}
 
 
 def test_missing_artefact_is_named(tmp_path):

@@ -323,6 +323,15 @@ def test_bad_colours_scores_files_and_stages_are_named() -> None:
     ]
 
 
+def test_cameras_that_code_colour_otherwise_and_log_footage_are_named() -> None:
+    usual = {"bit_depth": 10, "transfer": "bt709"}
+    colours = {"cam0": usual, "cam1": {"bit_depth": 8, "transfer": None}, "cam2": usual}
+    assert texts(replace(make_report(), colours=colours, log_like=("cam0", "cam2"))) == [
+        "colour: The video of cam1 is coded otherwise than most: bit depth 8, not 10; transfer untold, not bt709.",
+        'colour: cam0, cam2 look like log footage; say which in capture.toml, such as transfer = "slog3".',
+    ]
+
+
 def test_scores_without_held_out_cameras_are_not_sold_as_more() -> None:
     report = replace(make_report(), held_out=())
     assert "No camera was held out" in texts(report)[0]

@@ -1,0 +1,174 @@
+"""`packuv run` where output and disks fail and signals come: one sentence, and a code that is true."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.cli import FAILED, OK, main
+from pipelines.commands import run as command
+from pipelines.results import WHOLE, check_whole
+from tasks.artefacts.store import Store
+from tests.support.golden import FOLDER, SETTINGS
+from tests.support.places import ROOT
+
+CAPTURE = FOLDER / "capture"
+CODE = "import sys; from pipelines.cli import main; sys.exit(main())"
+MODES = pytest.mark.parametrize("mode", ["--direct", ""], ids=["direct", "prefect"])
+
+
+def words(out: Path, *more: str) -> list[str]:
+    """`packuv run` on the tiny capture."""
+    sets = [part for name, value in _flat(SETTINGS) for part in ("--set", f"{name}={value}")]
+    asked = ["run", str(CAPTURE), "--out", str(out), "--preset", "draft", "--hold-out", "cam03"]
+    return [sys.executable, "-c", CODE, *asked, *sets, *filter(None, more)]
+
+
+def _flat(settings: dict[str, Any], path: str = "") -> list[tuple[str, Any]]:
+    found = []
+    for name, value in settings.items():
+        match value:
+            case dict():
+                found += _flat(value, f"{path}{name}.")
+            case list():
+                found.append((f"{path}{name}", ",".join(map(str, value))))
+            case _:
+                found.append((f"{path}{name}", value))
+    return found
+
+
+def environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if not name.startswith("PREFECT")}
+
+
+def bash(script: str, asked: list[str]) -> tuple[int, str]:
+    """Exit code and errors of a script in which "$@" is the command."""
+    done = subprocess.run(
+        ["bash", "-c", script, "bash", *asked],
+        cwd=ROOT,
+        env=environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> Path:
+    """The output folder of a run that nothing befell."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    assert bash('"$@"', words(out, "--direct")) == (0, "")
+    return out
+
+
+def begun(undisturbed: Path, out: Path, *missing: str) -> None:
+    """The same run before it came to these stages."""
+    shutil.copytree(undisturbed / "tiny" / "store", out / "tiny" / "store")
+    for stage in missing:
+        shutil.rmtree(out / "tiny" / "store" / stage)
+
+
+def sha256(out: Path) -> str:
+    return hashlib.sha256((out / "tiny" / "scene.mkv").read_bytes()).hexdigest()
+
+
+@pytest.mark.slow
+@MODES
+def test_a_run_whose_output_nobody_reads_comes_to_its_end(undisturbed, tmp_path, mode):
+    begun(undisturbed, tmp_path, "encode", "verify", "evaluate")
+    assert bash('"$@" | head -1; exit ${PIPESTATUS[0]}', words(tmp_path, mode)) == (0, "")
+    assert sha256(tmp_path) == sha256(undisturbed)
+    for streams in (">&- 2>&- <&-", "> /dev/full 2>&1"):
+        for name in WHOLE:
+            (tmp_path / "tiny" / name).unlink()
+        assert bash(f'"$@" {streams}', words(tmp_path, mode)) == (0, "")
+        check_whole(tmp_path / "tiny")
+    code, errors = bash('"$@" > /dev/full', words(tmp_path, mode, "--json"))
+    assert code == FAILED
+    assert errors.endswith("packuv: cannot write to standard output: No space left on device\n")
+    assert not list(tmp_path.rglob("*.db*")), "the engine's database is in memory, so that no full disk stops it"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mode", "number", "code"),
+    [("--direct", signal.SIGHUP, 129), ("", signal.SIGHUP, 129), ("", signal.SIGINT, 130)],
+    ids=["direct-hup", "prefect-hup", "prefect-int"],
+)
+def test_signals_leave_run_json_and_no_job(undisturbed, tmp_path, mode, number, code):
+    begun(undisturbed, tmp_path, "motion")
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    with subprocess.Popen(words(tmp_path, mode), cwd=ROOT, env=environment(), text=True, **pipes) as run:
+        while not list(tmp_path.glob("tiny/store/.work/motion-*/job.log")):
+            assert run.poll() is None
+            time.sleep(0.05)
+        for _ in range(2):
+            run.send_signal(number)
+            time.sleep(0.05)
+        errors = run.communicate(timeout=60)[1]
+    assert run.returncode == code
+    assert errors.count("\n") == 1
+    assert errors.endswith("; the same command goes on from here\n")
+    record = json.loads((tmp_path / "tiny" / "run.json").read_text())
+    outcomes = {event["stage"]: event["outcome"] for event in record["stages"]}
+    assert outcomes["points"] == "reused"
+    assert outcomes.get("motion", "failed") == "failed"
+    assert not [line for line in _commands() if os.fsencode(tmp_path) in line]
+
+
+def _commands() -> Iterator[bytes]:
+    """Of all processes."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):  # it ended meanwhile
+            yield path.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mode", "limits"), [("--direct", [8, 20, 90]), ("", [8])], ids=["direct", "prefect"])
+def test_files_that_cannot_be_written_cost_one_sentence_and_no_artefact(undisturbed, tmp_path, mode, limits):
+    """The system refuses to make files longer than so many kilobytes, which needs no root and no disk of its own."""
+    begun(undisturbed, tmp_path, "motion", "background", "key", "segment", "encode", "verify", "evaluate")
+    for limit in limits:
+        code, errors = bash(f'ulimit -f {limit}; "$@"', words(tmp_path, mode))
+        assert code == FAILED
+        assert re.fullmatch(rf"packuv: File too large: {tmp_path}/tiny/\S+\n", errors)
+        assert Store(tmp_path / "tiny" / "store").verify() == []
+    assert bash('"$@"', words(tmp_path, mode)) == (0, "")
+    assert sha256(tmp_path) == sha256(undisturbed)
+
+
+@pytest.mark.parametrize("lost", WHOLE)
+def test_a_whole_run_has_all_its_files(tmp_path, monkeypatch, capsys, lost):
+    def ends(request, journal, *, direct):
+        class Outcome:
+            folder = tmp_path
+
+            def farewell(self) -> str:
+                return "done"
+
+        return Outcome()
+
+    for name in WHOLE:
+        (tmp_path / name).touch()
+    monkeypatch.setattr(command, "run", ends)
+    asked = ["run", str(CAPTURE), "--out", str(tmp_path)]
+    assert main(asked) == OK
+    (tmp_path / lost).unlink()
+    assert main([*asked, "--stop-after", "flow"]) == OK
+    assert main(asked) == FAILED
+    assert f"{tmp_path / lost} is not there" in capsys.readouterr().err
