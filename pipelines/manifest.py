@@ -170,8 +170,9 @@ def update(path: Path, found: Survey, *, progress: Progress = no_progress) -> Ma
             rows += read
             done += 1
     finally:
-        for capture in found.captures[done:]:
-            rows += [replace(row, sequence=capture.name) for row in remembered[capture.place]]
+        for one in found.captures[done:]:
+            known_rows = remembered.get(one.place, [])
+            rows += [replace(row, sequence=one.name, capture=str(one.folder)) for row in known_rows]
         manifest = Manifest(found.dataset, tuple(rows))
         write(path, manifest)
     return manifest
@@ -188,7 +189,7 @@ def scan(found: Survey, known: Manifest | None = None, *, progress: Progress = n
     stop = threading.Event()
     pool = ThreadPoolExecutor(READERS)
     try:
-        plans = list(pool.map(lambda one: _plan(one, remembered[one.place]), found.captures))
+        plans = list(pool.map(lambda one: _plan(one, remembered.get(one.place, [])), found.captures))
         meter = _Meter(progress, sum(plan.unread_bytes for plan in plans))
         waiting = deque[tuple[_Plan, dict[str, Future[dict[str, Any]]]]]()
         for plan in plans:
@@ -229,7 +230,7 @@ class _Meter:
             self._progress(self._done, self._total, self.note)
 
 
-def _by_place(manifest: Manifest | None) -> defaultdict[str, list[Row]]:
+def _by_place(manifest: Manifest | None) -> dict[str, list[Row]]:
     """Rows by the place of their capture in the data set, so that one that was moved as a whole is known."""
     found = defaultdict[str, list[Row]](list)
     if manifest is not None:
@@ -259,6 +260,7 @@ def _plan(found: Found, remembered: Sequence[Row]) -> _Plan:
 def _read(path: Path, tell: Callable[[int], None], stop: threading.Event) -> dict[str, Any]:
     """The columns that a video tells, and its problem."""
     facts: dict[str, Any] = {}
+    began_ns = time.time_ns()
     try:
         seen = signature(path)
         facts |= {"bytes": seen[0], "mtime_ns": seen[1]}
@@ -273,7 +275,7 @@ def _read(path: Path, tell: Callable[[int], None], stop: threading.Event) -> dic
             return facts | {"problem": f"{path} changed while it was read; scan again when it is whole"}
     except OSError as error:  # may be another the next time
         return facts | {"problem": sentence(error)}
-    if time.time_ns() - seen[2] > SETTLED_SECONDS * 1e9:
+    if began_ns - seen[2] > SETTLED_SECONDS * 1e9:
         facts |= {"ctime_ns": seen[2], "inode": seen[3]}
     return facts
 

@@ -282,11 +282,12 @@ def _find_videos(folder: Path) -> dict[str, Path]:
     files = [path for path in inside.iterdir() if path.is_file() and not path.name.startswith(".")]
     videos = _by_camera(inside, [path for path in files if path.suffix.lower() not in SIDECAR_SUFFIXES])
     for camera in videos:
-        # a line break would be lines of its own in a COLMAP model, an escape sequence a command to the terminal
-        if not (camera.isprintable() and camera.strip() == camera and _is_short(camera)):
+        # a line break would be lines of its own in a COLMAP model, which also reads names of cameras from paths of
+        # other systems; an escape sequence would be a command to the terminal
+        if not (camera.isprintable() and "\\" not in camera and camera.strip() == camera and _is_short(camera)):
             raise ValueError(
-                f"a camera's name must have 1 to {LONGEST_NAME} printable characters and no space at its ends, but is "
-                f"{camera!r}, that of a video in {inside}; rename the video"
+                f"a camera's name must have 1 to {LONGEST_NAME} printable characters, no \\ and no space at its ends, "
+                f"but is {camera!r}, that of a video in {inside}; rename the video"
             )
     return videos
 

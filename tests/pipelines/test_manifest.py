@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -140,6 +141,19 @@ def test_a_file_that_was_just_changed_is_read_again(data_set, opened, monkeypatc
     opened.clear()
     assert rows_of(data_set) == first
     assert len(opened) == 10
+
+
+def test_long_reading_does_not_settle_a_file(data_set, monkeypatch):
+    monkeypatch.setattr(manifest, "SETTLED_SECONDS", 0.5)
+
+    def probe(path: Path):
+        if path.parts[-4:] == ("day1", "dance", "videos", "cam01.mp4"):
+            time.sleep(0.6)
+        return probe_video(path)
+
+    monkeypatch.setattr(manifest, "probe_video", probe)
+    os.utime(data_set / "day1/dance/videos/cam01.mp4")
+    assert rows_of(data_set)[0].ctime_ns is None
 
 
 def test_a_file_that_changes_while_it_is_read_is_a_problem_until_it_stays(data_set, monkeypatch):

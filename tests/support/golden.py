@@ -140,7 +140,8 @@ def _measure_here() -> Found:
         plan = Plan(capture.folder, capture.videos, ("cam03",), 0, None, "cpu", True)
         options = compose("draft", capture.settings, SETTINGS)
         options = replace(options, keyframes=replace(options.keyframes, seam=100.0))
-        originals = Originals(capture, Path(folder) / "file_digests.json")
+        memory = Path(folder) / "file_digests.json"
+        originals = Originals(capture, memory)
         workshop = Workshop(store, originals, Jobs(threads=1), Quiet())
         steps: list[Stage] = []
 
@@ -151,12 +152,11 @@ def _measure_here() -> Found:
         sequence = Sequence(workshop, plan, options, submit, Made(), watched=True)
         sequence.run("report")
         only, rig = sequence.made.only, options.rig
-        make(borrow_rig(workshop, plan, only("sync"), workshop, only("rig"), rig))
+        make(borrow_rig(workshop, plan, only("sync"), options.pictures, workshop, only("rig"), rig))
         empty = _copied(capture.folder, Path(folder) / "take02", clean_plate=capture.folder)
         take = Take(groups=only("sync"), rig=only("points"), cameras=plan.fitted, stop=3)
-        make(
-            background_of(replace(workshop, capture=empty), take, options.fit.background), replace(site, capture=empty)
-        )
+        elsewhere = replace(workshop, originals=Originals(find_capture(empty), memory))
+        make(background_of(elsewhere, take, options.fit.background), replace(site, capture=empty))
         segment = sequence.made.keys["segment"][0]
         make(CutSegment(segment=segment, frames=2))
         following = next(stage for stage in steps if isinstance(stage, FitNext))

@@ -10,12 +10,14 @@ from calibration.accept import MatchesReport, Verdict
 from calibration.judge import SharedJudgement
 from calibration.moved import Standing
 from pipelines.events import Journal
+from sync.capture import find_capture
 from tasks.artefacts.jobs import Jobs
+from tasks.artefacts.originals import Originals
 from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import BorrowRig, RigOptions, _lent, _moved, find_rig, store_of
-from tasks.stages.footage import RIG, Take
+from tasks.stages.footage import RIG, PictureOptions, Take
 from tasks.stages.plan import Plan
 from tests.support.artefacts import put
 
@@ -78,7 +80,9 @@ def test_who_trusts_a_rig_that_was_lent_does_not_have_it_solved_again(tmp_path):
     videos = {name: tmp_path / "videos" / f"{name}.mp4" for name in NAMES}
     for video in videos.values():
         video.write_bytes(b"content")
-    workshop = Workshop(Store(tmp_path / "store"), tmp_path, Jobs(threads=1), Journal())
+    originals = Originals(find_capture(tmp_path), tmp_path / "file_digests.json")
+    workshop = Workshop(Store(tmp_path / "store"), originals, Jobs(threads=1), Journal())
     plan = Plan(tmp_path, videos, (), 0, None, "cpu", side_by_side=False)
-    stages = [find_rig(workshop, plan, STAGE.take.groups, RigOptions(trust=trust)) for trust in (False, True)]
+    groups, pictures = STAGE.take.groups, PictureOptions()
+    stages = [find_rig(workshop, plan, groups, pictures, RigOptions(trust=trust)) for trust in (False, True)]
     assert stages[0] == stages[1]

@@ -60,7 +60,8 @@ def site(tmp_path: Path) -> Site:
 
 @pytest.fixture
 def groups(site: Site, tmp_path: Path) -> Key:
-    stage = Synchronize(videos=Files({}), timecodes=Files({}), fps=None, timecode_column=None, options=AlignOptions())
+    videos = Files({f"cam0{number}": "content" for number in range(3)})
+    stage = Synchronize(videos=videos, timecodes=Files({}), fps=None, timecode_column=None, options=AlignOptions())
     _, folder = build_here(stage, site, tmp_path / "sync")
     return put(site, "sync", lambda out: shutil.copytree(folder, out, dirs_exist_ok=True))
 
