@@ -32,6 +32,7 @@ from tasks.artefacts.store import try_lock
 
 START_SECONDS = 300
 DATABASE = "prefect.db"
+DATABASE_VARIABLE = "PREFECT_SERVER_DATABASE_CONNECTION_URL"
 MEMORY = Path("/dev/shm")
 RESULTS = "/results"
 """Path under which our servers hand out the output folder"""
@@ -128,14 +129,18 @@ def running_server(
     lock: BinaryIO,
     out: Path,
     *,
-    database: Path,
+    database: Path | None,
     settings: Mapping[str, str],
     host: str = "127.0.0.1",
     port: int = 0,
 ) -> Iterator[Server]:
-    """Have a server that dies with this process; raises OSError for a port in use."""
-    fresh, log = _take_empty(database), home / "server.log"
-    settings = {**settings, "PREFECT_SERVER_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{database}"}
+    """Have a server that dies with this process; raises OSError for a port in use.
+
+    Without a database it uses the one that the user names.
+    """
+    fresh, log = database and _take_empty(database), home / "server.log"
+    if database:
+        settings = {**settings, DATABASE_VARIABLE: f"sqlite+aiosqlite:///{database}"}
     # The kernel queues what comes before the server accepts, and refuses what comes after the server has died.
     with socket.create_server((host, port)) as listener, open(log, "wb") as output:
         address = f"http://{host}:{listener.getsockname()[1]}/api"
@@ -257,9 +262,13 @@ def _homes(out: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _passing(home: Path) -> Iterator[Path]:
+def _passing(home: Path) -> Iterator[Path | None]:
     """A database that goes with the run, in memory where the system has a place for that: a full disk is no matter of
-    the engine. Its name follows from the folder, so that what a killed run left is taken away by the next one."""
+    the engine. Its name follows from the folder, so that what a killed run left is taken away by the next one. None
+    where the user names a database."""
+    if DATABASE_VARIABLE in os.environ:
+        yield None
+        return
     name = hashlib.sha256(f"{os.getuid()} {home}".encode()).hexdigest()[:16]
     path = MEMORY / f"packuv-{name}.db" if os.access(MEMORY, os.W_OK) else home / DATABASE
     _remove(path)

@@ -170,15 +170,14 @@ def test_side_by_side_a_border_that_shows_is_fitted_again_from_the_frame_before_
     assert seam_of(mended) < seam_of(apart)
 
 
-def test_a_full_disk_is_refused_before_the_work(first, capture, tmp_path, monkeypatch):
-    outcome, _ = first
+def test_a_full_disk_is_refused_before_the_work(capture, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     with monkeypatch.context() as patched:
         patched.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
         with pytest.raises(
-            OSError, match=r"needs about .* GB under .*store, but 0\.0 GB are free; choose another --out"
+            OSError, match=r"needs about .*B more under .*store, but .*B are free; free some, or choose another --out"
         ):
-            run(request(capture, outcome.folder.parent))
+            run(request(capture, tmp_path))
 
 
 def test_an_earlier_stop_and_another_seed(first, capture):
@@ -255,11 +254,12 @@ def test_a_video_that_is_another_one_for_a_while_leaves_nothing_wrong_behind(fir
         return engine
 
     with ThreadPoolExecutor(max_workers=1) as pool:
+        changed = Engine(stage_after("ChooseKeyframes", capture / "videos/cam02.mp4"))
         with pytest.raises(ValueError, match=r"cam01\.mp4 has another content than when this run began; put back"):
-            process(asked, Journal(), stage_after("ChooseKeyframes", capture / "videos/cam02.mp4"))
+            process(asked, Journal(), changed, jobs_of(asked))
         assert seen[-1] == "FindBackground"
         shutil.copyfile(capture / "videos/cam01.mp4", video)
-        whole = process(asked, Journal(), stage_after("", video))
+        whole = process(asked, Journal(), Engine(stage_after("", video)), jobs_of(asked))
     assert made(whole).isdisjoint({"sync", "rig", "points", "motion", "keyframes"})
     assert sha256(whole.scene) == sha256(outcome.scene)
 

@@ -51,7 +51,9 @@ def _flat(settings: dict[str, Any], path: str = "") -> list[tuple[str, Any]]:
 
 
 def environment() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if not name.startswith("PREFECT")}
+    """That of a user who has set nothing but where the engine's database is: in no file, whose size has limits here."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT")}
+    return {**kept, "PREFECT_SERVER_DATABASE_CONNECTION_URL": "sqlite+aiosqlite:///:memory:"}
 
 
 def bash(script: str, asked: list[str]) -> tuple[int, str]:
