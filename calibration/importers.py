@@ -69,7 +69,7 @@ def load_rig(path: Path, names: Sequence[str] | None = None) -> Rig:
     file = _find(path) if path.is_dir() else path
     try:
         views, metric = _read(file, names)
-    except (KeyError, TypeError, IndexError, EOFError, struct.error) as problem:
+    except (LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, EOFError, struct.error) as problem:
         raise ValueError(f"{file} is damaged or not a calibration: {type(problem).__name__}: {problem}") from problem
     except ValueError as problem:
         raise ValueError(f"{file}: {problem}") from problem
@@ -393,7 +393,7 @@ def _caliscope_view(table: Mapping[str, Any]) -> _View:
 
 
 def _read_poses_bounds(file: Path, names: Sequence[str] | None) -> list[_View]:
-    rows = np.load(file, allow_pickle=False)
+    rows = np.load(file, mmap_mode="r", allow_pickle=False)  # mapped: its shape is held against the file's size
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise ValueError(
             f"poses_bounds.npy must hold a row of 17 finite numbers for each camera, but is {rows.shape}, "

@@ -281,7 +281,7 @@ def _compare(frames: Sequence[Path], out: Path, options: AdoptOptions) -> tuple[
     if not options.compared_frames:
         return pruned, finished
     with open_scene(out) as scene:
-        near = float(scene.header.extra["near"])
+        near = scene.header.near
         for frame in np.unique(np.linspace(0, len(frames) - 1, options.compared_frames).round().astype(int)):
             truth, _ = read_frame(frames[frame], sh_degree=options.sh_degree)
             stored = scene.codes(int(frame))
