@@ -171,7 +171,7 @@ def check_unpacked(unpacked_bytes: int, packed_bytes: int, what: str) -> None:
 def check_depth(value: object, what: str) -> None:
     """Raises ValueError for lists and objects within one another more than MOST_JSON_DEPTH deep."""
     level: Sequence[Any] = [value]
-    for _ in range(MOST_JSON_DEPTH + 1):
+    for _ in range(MOST_JSON_DEPTH):
         level = [
             child
             for node in level

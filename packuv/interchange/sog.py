@@ -6,6 +6,7 @@ into codebooks (version 2) or shares of a range (version 1), SH bands above 0 in
 
 from __future__ import annotations
 
+import errno
 import math
 import zipfile
 import zlib
@@ -26,6 +27,7 @@ from packuv.bounds import (
     finite,
     items,
     numbers,
+    shown,
     whole,
     words,
 )
@@ -40,6 +42,8 @@ PICTURES = 5
 """Pictures of a scene without SH bands, a texel of 4 bytes for each Gaussian."""
 MOST_PICTURE_BYTES = 4 * MOST_PIXELS
 """Of a WebP file: not more than its texels take."""
+MESSAGE = 300
+"""Characters of a message of the zip reader, which may repeat a header."""
 SLACK = 1 << 16
 """Texels that a picture may have beyond twice the Gaussians: sides are rounded up."""
 MOST_LOG = 60
@@ -75,10 +79,12 @@ def read_sog(path: Path) -> Gaussians:
         with zipfile.ZipFile(path) as archive:
             meta = parse_json(_in_archive(archive, META), META)
             return _gaussians(meta, lambda name: _in_archive(archive, name), path.stat().st_size)
-    except _DAMAGED as error:
-        raise ValueError(f"{path} is no SOG scene, or damaged: {error}") from None
-    except ValueError as error:
-        raise ValueError(f"{path} is no SOG scene, or damaged: {error}") from None
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # what a place before the file's start gives
+            raise
+        raise ValueError(f"{path} is no SOG scene, or damaged: it points outside itself") from None
+    except (*_DAMAGED, ValueError) as error:
+        raise ValueError(f"{path} is no SOG scene, or damaged: {str(error)[:MESSAGE]}") from None
 
 
 def _in_folder(folder: Path, name: str) -> bytes:
@@ -101,7 +107,7 @@ def _in_archive(archive: zipfile.ZipFile, name: str) -> bytes:
 def _gaussians(meta: Any, read: Callable[[str], bytes], packed_bytes: int) -> Gaussians:
     version = fields(meta, META).get("version", 1)
     if version not in (1, 2):
-        raise ValueError(f"it is SOG version {version}, this program reads 1 and 2")
+        raise ValueError(f"it is SOG version {shown(version)}, this program reads 1 and 2")
     parts = {name: fields(field(meta, name, META), name) for name in ("means", "scales", "quats", "sh0")}
     said = meta["count"] if "count" in meta else items(field(parts["means"], "shape", "means"), "shape", most=4)[:1]
     count = whole(said[0] if isinstance(said, list) and said else said, "its count", most=MOST_GAUSSIANS)

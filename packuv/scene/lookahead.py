@@ -19,7 +19,6 @@ import numpy as np
 from packuv.scene.header import TRACK_NAMES, SceneIndex
 from packuv.scene.matroska import Decoder, FoundPacket, Reader
 
-
 MOST_PIXELS_A_BYTE = 256
 """Of a packet; FFV1's range coder gets a picture of one grey to 98"""
 
