@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-MOST_SIDE_PX, MOST_PIXELS = 2**15, 2**28
-"""Of a picture; packuv.bounds has the same"""
+MOST_SIDE_PX, MOST_PIXELS, MOST_NUMBER = 2**15, 2**28, 1e30
+"""Of a picture, and of lengths and lens parameters; packuv.bounds has the same"""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,10 @@ class Camera:
                 f"camera {self.name!r}: OpenCV lens models have 4, 5 or 8 coefficients, not {len(self.distortion)}"
             )
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, *self.gains, self.width, self.height)
-        if not np.all(np.isfinite(numbers)):
+        if not np.all(np.abs([*numbers, *self.camera_from_world[:3, 3]]) <= MOST_NUMBER):
             raise ValueError(
-                f"camera {self.name!r}: intrinsics, lens, gains and size must be finite, but are {numbers}"
+                f"camera {self.name!r}: intrinsics, lens, gains, size and place must be finite, up to {MOST_NUMBER:g}, "
+                f"but are {numbers} and {self.camera_from_world[:3, 3].tolist()}"
             )
         if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
             raise ValueError(

@@ -167,6 +167,7 @@ def _header(survey: _Survey, frames: Sequence[Path], options: AdoptOptions) -> S
     return SceneHeader(survey.quantizer(), times, options.rate, cameras, extra=extra)
 
 
+@np.errstate(invalid="ignore")  # broken values are counted, not computed with
 def read_frame(path: Path, *, sh_degree: int | None) -> tuple[Gaussians, int]:
     """The Gaussians of a file that a renderer draws, in canonical form, and the number of the others."""
     whole = read_gaussians(path)

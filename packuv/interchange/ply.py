@@ -100,8 +100,7 @@ def columns_of(path: Path, table: np.ndarray, names: Sequence[str]) -> np.ndarra
     missing = [name for name in names if name not in (table.dtype.names or ())]
     if missing:
         raise ValueError(f"{path} lacks the columns {missing}; is it a PLY of Gaussians?")
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is dropped as broken
-        return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+    return np.stack([table[name].astype(np.float32) for name in names], axis=1)
 
 
 @dataclass(frozen=True)
