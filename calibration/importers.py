@@ -16,6 +16,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from tokenize import TokenError
 from typing import Any
 
 import cv2
@@ -26,6 +27,20 @@ from calibration.rig import Camera, Rig
 _PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".exr"}
 _VIDEO_SUFFIXES = {".mp4", ".mov", ".mkv", ".avi", ".webm", ".mxf"}
 _NAMES_SHOWN = 8
+_SHOWN = 1000
+"""Characters of a message, which may repeat what a file says."""
+_STRANGE = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    RecursionError,
+    TokenError,  # of the header of an .npy file
+    TypeError,
+    cv2.error,
+    struct.error,
+)
+"""What look-ups and arithmetic in a strange file raise."""
 # COLMAP's model number: name and count of parameters (src/colmap/sensor/models.h).
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
@@ -68,11 +83,13 @@ def load_rig(path: Path, names: Sequence[str] | None = None) -> Rig:
         raise FileNotFoundError(f"no calibration at {path}")
     file = _find(path) if path.is_dir() else path
     try:
-        views, metric = _read(file, names)
-    except (KeyError, TypeError, IndexError, EOFError, struct.error) as problem:
-        raise ValueError(f"{file} is damaged or not a calibration: {type(problem).__name__}: {problem}") from problem
+        with np.errstate(all="ignore"):  # what is not finite is refused by the camera it belongs to
+            views, metric = _read(file, names)
+    except _STRANGE as problem:
+        kind = type(problem).__name__
+        raise ValueError(f"{file} is damaged or not a calibration: {kind}: {str(problem)[:_SHOWN]}") from problem
     except ValueError as problem:
-        raise ValueError(f"{file}: {problem}") from problem
+        raise ValueError(f"{file}: {str(problem)[:_SHOWN]}") from problem
     if not views:
         raise ValueError(f"{file} holds no posed pictures")
     return Rig(tuple(_cameras(views, names, file)), str(file), metric)
@@ -393,7 +410,7 @@ def _caliscope_view(table: Mapping[str, Any]) -> _View:
 
 
 def _read_poses_bounds(file: Path, names: Sequence[str] | None) -> list[_View]:
-    rows = np.load(file, allow_pickle=False)
+    rows = np.load(file, mmap_mode="r", allow_pickle=False)  # mapped: its shape is held against the file's size
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise ValueError(
             f"poses_bounds.npy must hold a row of 17 finite numbers for each camera, but is {rows.shape}, "

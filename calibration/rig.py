@@ -15,6 +15,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+MOST_SIDE_PX, MOST_PIXELS, MOST_NUMBER = 2**15, 2**28, 1e30
+"""Of a picture, and of lengths and lens parameters; packuv.bounds has the same"""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -42,13 +45,21 @@ class Camera:
             raise ValueError(
                 f"camera {self.name!r}: OpenCV lens models have 4, 5 or 8 coefficients, not {len(self.distortion)}"
             )
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, *self.gains)
-        if not np.all(np.isfinite(numbers)):
-            raise ValueError(f"camera {self.name!r}: intrinsics, lens and gains must be finite, but are {numbers}")
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, *self.gains, self.width, self.height)
+        if not np.all(np.abs([*numbers, *self.camera_from_world[:3, 3]]) <= MOST_NUMBER):
+            raise ValueError(
+                f"camera {self.name!r}: intrinsics, lens, gains, size and place must be finite, up to {MOST_NUMBER:g}, "
+                f"but are {numbers} and {self.camera_from_world[:3, 3].tolist()}"
+            )
         if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
             raise ValueError(
                 f"camera {self.name!r}: size and focal lengths must be positive, but are "
                 f"{self.width}x{self.height} and {self.fx}, {self.fy}"
+            )
+        if max(self.width, self.height) > MOST_SIDE_PX or self.width * self.height > MOST_PIXELS:
+            raise ValueError(
+                f"camera {self.name!r}: a picture has sides up to {MOST_SIDE_PX} and at most {MOST_PIXELS} pixels, "
+                f"but is {self.width}x{self.height}"
             )
 
     @property
@@ -166,7 +177,7 @@ class Rig:
             return cls(cameras, str(data["source"]), bool(data["metric"]))
         except KeyError as missing:
             raise ValueError(f"{path}: a rig file needs the field {missing}; docs/calibration.md lists them") from None
-        except (TypeError, json.JSONDecodeError) as problem:
+        except (TypeError, RecursionError, OverflowError, json.JSONDecodeError) as problem:
             raise ValueError(f"{path}: not a rig file ({problem}); docs/calibration.md shows one") from None
 
 

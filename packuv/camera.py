@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from packuv.bounds import check_picture, field, fields, finite, numbers, positive, words
+
 
 @dataclass(frozen=True)
 class PinholeCamera:
@@ -28,13 +30,16 @@ class PinholeCamera:
     """Rigid transform, float64 [4, 4]; maps world points to camera axes."""
 
     def __post_init__(self) -> None:
+        what = f"camera {self.name!r}"
         if self.camera_from_world.shape != (4, 4):
-            raise ValueError(f"camera {self.name!r}: {self.camera_from_world.shape=}, but a pose is [4, 4]")
-        if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
-            raise ValueError(
-                f"camera {self.name!r}: size and focal lengths must be positive, "
-                f"but are {self.width}x{self.height} and {self.fx}, {self.fy}"
-            )
+            raise ValueError(f"{what}: {self.camera_from_world.shape=}, but a pose is [4, 4]")
+        if not np.isfinite(self.camera_from_world).all():
+            raise ValueError(f"{what}: the pose must hold finite numbers, but is {self.camera_from_world.tolist()}")
+        check_picture(self.width, self.height, what)
+        for name in ("fx", "fy"):
+            positive(float(getattr(self, name)), f"{what}: {name}")
+        for name in ("cx", "cy"):
+            finite(float(getattr(self, name)), f"{what}: {name}")
 
     @property
     def centre(self) -> np.ndarray:
@@ -80,17 +85,12 @@ class PinholeCamera:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> PinholeCamera:
-        """Inverse of `to_json`; raises ValueError that names a missing field."""
-        try:
-            return cls(
-                str(data["name"]),
-                int(data["width"]),
-                int(data["height"]),
-                float(data["fx"]),
-                float(data["fy"]),
-                float(data["cx"]),
-                float(data["cy"]),
-                np.asarray(data["camera_from_world"], dtype=np.float64),
-            )
-        except KeyError as missing:
-            raise ValueError(f"a camera needs the field {missing}, but has {sorted(data)}") from None
+        """Inverse of `to_json`; raises ValueError that names what is missing or no number."""
+        name = words(field(fields(data, "a camera"), "name", "a camera"), "a camera's name")
+        what = f"camera {name!r}"
+        width, height, fx, fy, cx, cy = (
+            finite(field(data, key, what), f"{what}: {key}") for key in ("width", "height", "fx", "fy", "cx", "cy")
+        )
+        check_picture(width, height, what)
+        pose = numbers(field(data, "camera_from_world", what), f"{what}: camera_from_world", (4, 4))
+        return cls(name, int(width), int(height), fx, fy, cx, cy, pose)

@@ -12,6 +12,34 @@ from typing import Any
 
 import numpy as np
 
+from packuv.bounds import MOST_JSON_BYTES, MOST_JSON_VALUES, check_depth
+
+
+def parse_json(content: bytes, what: str) -> Any:
+    """A JSON document of bounded size and depth; raises ValueError that names `what` for anything else.
+
+    NaN and infinity pass, so that who reads a number can say which one is wrong.
+    """
+    if len(content) > MOST_JSON_BYTES:
+        raise ValueError(f"{what} must be JSON of at most {MOST_JSON_BYTES} bytes, but has {len(content)}")
+    values = sum(map(content.count, (b",", b"[", b"{")))
+    if values > MOST_JSON_VALUES:
+        raise ValueError(f"{what} must be JSON of at most {MOST_JSON_VALUES} values, but has about {values}")
+    try:
+        data = json.loads(content)
+    except RecursionError:
+        raise ValueError(f"{what} is nested too deep for JSON") from None
+    except ValueError as error:  # not UTF-8, not JSON, or an integer of thousands of digits
+        raise ValueError(f"{what} is no JSON: {error}") from None
+    check_depth(data, what)
+    return data
+
+
+def load_json(path: Path) -> Any:
+    """A JSON file of bounded size and depth; raises ValueError that names it, or what opening it raises."""
+    with Path(path).open("rb") as file:
+        return parse_json(file.read(MOST_JSON_BYTES + 1), str(path))
+
 
 def save_json(path: Path, data: Mapping[str, Any]) -> None:
     """Readable JSON, keys in the given order."""

@@ -110,7 +110,7 @@ class Artist:
     """Draws Gaussians of a scene as its fit did."""
 
     def __init__(self, scene: Scene, device: str = "cpu") -> None:
-        self._options = RasterOptions(near=float(scene.header.extra["near"]), device=device)
+        self._options = RasterOptions(near=scene.header.near, device=device)
         self._arena = Arena()
 
     def draw(self, gaussians: Gaussians, camera: PinholeCamera) -> np.ndarray:

@@ -22,6 +22,7 @@ from typing import Any
 import av
 import numpy as np
 
+from packuv import bounds
 from packuv.atlas.picture import (
     POSITION_HI,
     POSITION_LO,
@@ -32,12 +33,14 @@ from packuv.atlas.picture import (
     seat,
     triplet_names,
 )
-from packuv.files import whole_file
+from packuv.bounds import field as field_of
+from packuv.files import parse_json, whole_file
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.uvsize import UvOptions
 from packuv.progress import Progress, no_progress
 from packuv.scene import Scene, SceneHeader, open_scene
 from packuv.scene.header import codes_digest
+from packuv.scene.matroska import open_matroska
 
 FORMAT, VERSION, ATTACHMENT = "packuv-atlas", 1, "atlas.json"
 EXACT_ALWAYS = (POSITION_HI, POSITION_LO)
@@ -45,6 +48,8 @@ EXACT_ALWAYS = (POSITION_HI, POSITION_LO)
 MULTIPLE, LEAST = 8, 64
 """Picture sizes are multiples of this, and at least that: what the encoders ask for"""
 TIME_BASE = Fraction(1, 1000)
+MOST_AHEAD = 256
+"""Pictures of one track that wait for those of the others; the decoders' own delays are far shorter"""
 
 
 class AtlasCodec(StrEnum):
@@ -371,29 +376,51 @@ class AtlasVideo:
         if not documents:
             raise ValueError(f"{path} is no atlas video: it lacks the attachment {ATTACHMENT}")
         try:
-            self._read_document(json.loads(documents[0] or b""))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: its {ATTACHMENT} cannot be read: {error!r}") from None
+            self._read_document(parse_json(documents[0] or b"", "it"))
+        except ValueError as error:
+            raise ValueError(f"{path}: its {ATTACHMENT} cannot be read: {error}") from None
         if titles != self.triplets:
             raise ValueError(f"{path} must have the video tracks {self.triplets}, but has {titles}")
 
     def _open(self) -> Any:
         try:
-            return av.open(str(self.path), format="matroska", metadata_errors="replace")
+            return open_matroska(self.path)
         except av.FFmpegError as error:
             raise ValueError(f"{self.path} is no Matroska file, or damaged ({error.strerror})") from None
 
-    def _read_document(self, data: Mapping[str, Any]) -> None:
-        if (data["format"], data["version"]) != (FORMAT, VERSION):
-            raise ValueError(f"it is {data['format']} version {data['version']}, not {FORMAT} {VERSION}")
+    def _read_document(self, document: object) -> None:
+        data = bounds.fields(document, "it")
+        kind, version, digests, triplets, segments, stacked, *size = (
+            field_of(data, name, "it")
+            for name in ("format", "version", "digests", "triplets", "segments", "stacked", "height", "width")
+        )
+        if (kind, version) != (FORMAT, VERSION):
+            said = [bounds.shown(value).strip("'") for value in (kind, version)]
+            raise ValueError(f"it is {said[0]} version {said[1]}, not {FORMAT} {VERSION}")
         self.header = SceneHeader.from_json(data)
-        self.digests: tuple[str, ...] = tuple(data["digests"])
-        self.triplets: tuple[str, ...] = tuple(data["triplets"])
-        self.segments = tuple((int(part["first"]), int(part["frames"])) for part in data["segments"])
+        most, listed = bounds.MOST_FRAMES, bounds.items(triplets, "triplets", most=100)
+        self.digests = tuple(bounds.words(text, "digests") for text in bounds.items(digests, "digests", most=most))
+        self.triplets = triplet_names(self.header.quantizer.sh_degree)
+        if tuple(listed) != self.triplets:
+            raise ValueError(f"it must have the triplets {', '.join(self.triplets)}, but has {bounds.shown(triplets)}")
+        parts = [bounds.fields(part, "a segment") for part in bounds.items(segments, "segments", most=most)]
+        self.segments = tuple(
+            (
+                bounds.whole(field_of(part, "first", "a segment"), "a segment: first", most=most),
+                bounds.whole(field_of(part, "frames", "a segment"), "a segment: frames", least=1, most=most),
+            )
+            for part in parts
+        )
         """First scene frame and number of frames of each"""
-        if sum(length for _, length in self.segments) != len(self.digests):
-            raise ValueError(f"segments {self.segments} do not hold its {len(self.digests)} frames")
-        self._stacked, self._size = bool(data["stacked"]), (int(data["height"]), int(data["width"]))
+        ends = np.cumsum([0, *(length for _, length in self.segments)]).tolist()
+        starts = [first for first, _ in self.segments]
+        if starts != ends[:-1] or not ends[-1] == len(self.digests) == len(self.header.times_ns):
+            raise ValueError(
+                f"its {len(starts)} segments, {len(self.digests)} digests and {len(self.header.times_ns)} times do not "
+                "belong together"
+            )
+        bounds.check_picture(size[1], size[0], "its pictures")
+        self._stacked, self._size = bool(stacked), (int(size[0]), int(size[1]))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -410,6 +437,8 @@ class AtlasVideo:
         count = 0
         for name, picture in self._decoded():
             waiting[name].append(picture)
+            if len(waiting[name]) > MOST_AHEAD:
+                raise ValueError(f"{self.path}: track {name!r} runs ahead of the others; it is damaged")
             while all(waiting.values()):
                 yield {name: queue.popleft() for name, queue in waiting.items()}
                 count += 1
@@ -430,14 +459,14 @@ class AtlasVideo:
     def _picture(self, frame: Any) -> np.ndarray:
         height, width = self._size
         picture: np.ndarray
+        if (frame.height, frame.width) != (3 * height if self._stacked else height, width):
+            raise ValueError(f"{self.path} has pictures of {frame.width} x {frame.height}, but says {width} x {height}")
         if not self._stacked:
             picture = frame.to_ndarray(format="rgb24")
         else:
             plane = frame.planes[0]
             luma = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
             picture = luma.reshape(3, -1, plane.width).transpose(1, 2, 0)
-        if picture.shape != (height, width, 3):
-            raise ValueError(f"{self.path} has pictures of {picture.shape}, but says {height} x {width}")
         return picture
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from packuv.bounds import field, finite, items, numbers
 from packuv.camera import PinholeCamera
 from packuv.colour import linear_from_srgb, srgb_from_linear
 
@@ -44,8 +45,11 @@ class LensCamera:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> LensCamera:
-        red, green, blue = data["gains"]
-        return cls(PinholeCamera.from_json(data), tuple(data["distortion"]), (red, green, blue))
+        pinhole = PinholeCamera.from_json(data)
+        what = f"camera {pinhole.name!r}"
+        red, green, blue = numbers(field(data, "gains", what), f"{what}: gains", (3,)).tolist()
+        lens = items(field(data, "distortion", what), f"{what}: distortion", most=max(DISTORTION_LENGTHS))
+        return cls(pinhole, tuple(finite(k, f"{what}: distortion") for k in lens), (red, green, blue))
 
 
 def gain_table(gains: tuple[float, float, float]) -> np.ndarray:

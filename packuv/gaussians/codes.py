@@ -8,13 +8,14 @@ Positions are 16-bit on a symmetric-log scale about the scene's centre, the rest
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numba import prange
 
+from packuv.bounds import MOST_NUMBER, MOST_SH_DEGREE, field, fields, numbers, positive, whole
 from packuv.gaussians.floats import Gaussians, arrays
 from packuv.kernels.compile import kernel
 
@@ -77,15 +78,20 @@ class Quantizer:
     """float64 [A]: value of code 0"""
     high: np.ndarray
     """float64 [A]: value of code 255"""
-    sh_degree: int = field(default=0)
+    sh_degree: int = 0
 
     def __post_init__(self) -> None:
-        count = attribute_count(self.sh_degree)
+        count = attribute_count(whole(self.sh_degree, "a quantizer's sh_degree", most=MOST_SH_DEGREE))
         if self.low.shape != (count,) or self.high.shape != (count,):
             raise ValueError(
                 f"SH degree {self.sh_degree} has {count} columns, but the ranges have "
                 f"{self.low.shape} and {self.high.shape}"
             )
+        for name in ("centre", "unit", "reach", "low", "high"):
+            if not (np.abs(getattr(self, name)) <= MOST_NUMBER).all():
+                raise ValueError(
+                    f"a quantizer's {name} must be finite, up to {MOST_NUMBER:g}, but is {getattr(self, name)}"
+                )
         if not (self.high > self.low).all() or not (self.reach > 0).all() or not self.unit > 0:
             raise ValueError("every range of a quantizer must be positive")
 
@@ -146,8 +152,13 @@ class Quantizer:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Quantizer:
-        arrays = {key: np.asarray(data[key], dtype=np.float64) for key in ("centre", "reach", "low", "high")}
-        return cls(unit=float(data["unit"]), sh_degree=int(data["sh_degree"]), **arrays)
+        what = "the quantizer"
+        degree = whole(field(fields(data, what), "sh_degree", what), "the quantizer's sh_degree", most=MOST_SH_DEGREE)
+        sizes = {"centre": 3, "reach": 3, "low": attribute_count(degree), "high": attribute_count(degree)}
+        arrays = {
+            key: numbers(field(data, key, what), f"the quantizer's {key}", (size,)) for key, size in sizes.items()
+        }
+        return cls(unit=positive(field(data, "unit", what), "the quantizer's unit"), sh_degree=degree, **arrays)
 
 
 def attribute_values(gaussians: Gaussians) -> np.ndarray:

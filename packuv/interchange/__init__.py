@@ -9,6 +9,8 @@ from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 
+import numpy as np
+
 from packuv.gaussians.floats import DRAWN_LOGIT, SH_C0, Gaussians
 from packuv.interchange.compressed_ply import CHUNK, unpack, write_compressed_ply
 from packuv.interchange.ply import gaussians_of, read_tables, write_ply
@@ -93,5 +95,6 @@ def read_ply(path: Path) -> Gaussians:
     """
     tables = read_tables(path)
     if "vertex" not in tables:
-        raise ValueError(f"{path} has no element vertex, but {sorted(tables)}")
-    return unpack(path, tables) if "chunk" in tables else gaussians_of(path, tables["vertex"])
+        raise ValueError(f"{path} has no element vertex, but {sorted(tables)[:8]}")
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is infinite, and dropped as broken
+        return unpack(path, tables) if "chunk" in tables else gaussians_of(path, tables["vertex"])

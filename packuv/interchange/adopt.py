@@ -167,6 +167,7 @@ def _header(survey: _Survey, frames: Sequence[Path], options: AdoptOptions) -> S
     return SceneHeader(survey.quantizer(), times, options.rate, cameras, extra=extra)
 
 
+@np.errstate(invalid="ignore")  # broken values are counted, not computed with
 def read_frame(path: Path, *, sh_degree: int | None) -> tuple[Gaussians, int]:
     """The Gaussians of a file that a renderer draws, in canonical form, and the number of the others."""
     whole = read_gaussians(path)
@@ -281,7 +282,7 @@ def _compare(frames: Sequence[Path], out: Path, options: AdoptOptions) -> tuple[
     if not options.compared_frames:
         return pruned, finished
     with open_scene(out) as scene:
-        near = float(scene.header.extra["near"])
+        near = scene.header.near
         for frame in np.unique(np.linspace(0, len(frames) - 1, options.compared_frames).round().astype(int)):
             truth, _ = read_frame(frames[frame], sh_degree=options.sh_degree)
             stored = scene.codes(int(frame))

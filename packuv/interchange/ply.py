@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from packuv.bounds import MOST_GAUSSIANS, MOST_SH_DEGREE, shown
 from packuv.files import whole_file
 from packuv.gaussians.floats import Gaussians, drawn
 
@@ -18,6 +20,7 @@ _TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
+MOST_HEADER_BYTES = 1 << 20
 _NAMES = {"f4": "float", "u4": "uint", "u1": "uchar"}
 
 
@@ -50,7 +53,7 @@ def gaussians_of(path: Path, table: np.ndarray) -> Gaussians:
     """Gaussians of the element `vertex` of a standard PLY."""
     rest = sum(name.startswith("f_rest_") for name in table.dtype.names or ())
     degree = math.isqrt(rest // 3 + 1) - 1
-    if 3 * ((degree + 1) ** 2 - 1) != rest:
+    if 3 * ((degree + 1) ** 2 - 1) != rest or degree > MOST_SH_DEGREE:
         raise ValueError(f"{path} has {rest} columns f_rest_*; whole SH bands need 0, 9, 24 or 45")
     dc = columns_of(path, table, [f"f_dc_{k}" for k in range(3)])
     if rest:
@@ -108,11 +111,13 @@ class _Element:
 
 
 def _read_header(path: Path, file: BinaryIO) -> list[_Element]:
-    if file.readline().strip() != b"ply":
+    if file.readline(8).strip() != b"ply":
         raise ValueError(f"{path} is not a PLY file")
     order = ""
     found: list[tuple[str, int, list[tuple[str, str]]]] = []
-    for raw in file:
+    while raw := file.readline(MOST_HEADER_BYTES):
+        if file.tell() >= MOST_HEADER_BYTES:
+            raise ValueError(f"{path}: a PLY header has an end within {MOST_HEADER_BYTES} bytes, but this one none")
         words = raw.decode("ascii", errors="replace").split()
         match words:
             case ["format", "binary_little_endian", _]:
@@ -120,13 +125,13 @@ def _read_header(path: Path, file: BinaryIO) -> list[_Element]:
             case ["format", "binary_big_endian", _]:
                 order = ">"
             case ["format", *rest]:
-                raise ValueError(f"{path} is a PLY of format {' '.join(rest)!r}; export it as a binary PLY")
-            case ["element", name, count] if count.isdecimal():
+                raise ValueError(f"{path} is a PLY of format {' '.join(rest)[:40]!r}; export it as a binary PLY")
+            case ["element", name, count] if count.isdecimal() and len(count) <= len(str(2**64)):
                 found.append((name, int(count), []))
             case ["property", kind, name] if kind in _TYPES and found:
                 found[-1][2].append((name, order + _TYPES[kind]))
             case ["end_header"]:
-                return [_Element(name, count, np.dtype(fields)) for name, count, fields in found]
+                return [_element(path, *parts) for parts in found]
             case ["comment" | "obj_info", *_] | []:
                 continue
             case _:
@@ -134,12 +139,25 @@ def _read_header(path: Path, file: BinaryIO) -> list[_Element]:
     raise ValueError(f"{path}: its header has no end; the file is cut short")
 
 
+def _element(path: Path, name: str, count: int, columns: list[tuple[str, str]]) -> _Element:
+    names = [column for column, _ in columns]
+    if len(set(names)) != len(names):
+        twice = next(column for column in names if names.count(column) > 1)
+        raise ValueError(f"{path}: element {shown(name)} has the column {shown(twice)} more than once")
+    if count > MOST_GAUSSIANS:
+        raise ValueError(f"{path}: element {shown(name)} has {count} entries, but {MOST_GAUSSIANS} is the most")
+    return _Element(name, count, np.dtype(columns))
+
+
 def _read_table(path: Path, file: BinaryIO, element: _Element) -> np.ndarray:
     size = element.count * element.dtype.itemsize
-    data = file.read(size)
-    if len(data) != size:
+    there = os.fstat(file.fileno()).st_size - file.tell()
+    if there < size:
         raise ValueError(
             f"{path} is cut short: element {element.name} needs {size} bytes for {element.count} entries, "
-            f"but {len(data)} are there"
+            f"but {there} are there"
         )
+    data = file.read(size)
+    if not size:
+        return np.zeros(element.count if element.dtype.names else 0, element.dtype)
     return np.frombuffer(data, element.dtype)

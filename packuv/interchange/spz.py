@@ -14,10 +14,12 @@ import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from packuv.bounds import check_count, check_unpacked
 from packuv.files import whole_file
 from packuv.gaussians.floats import Gaussians, drawn
 from packuv.interchange.conventions import alpha_codes, drop_largest, logits_of_alpha, restore_largest
@@ -99,8 +101,9 @@ class _Header:
 def _open(data: bytes) -> tuple[_Header, list[np.ndarray]]:
     """Header, and the streams as bytes."""
     packed = data[:2] == b"\x1f\x8b"
-    data = gzip.decompress(data) if packed else data
-    magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(data)
+    unpacker = zlib.decompressobj(wbits=31)
+    start = unpacker.decompress(data, HEADER.size) if packed else data
+    magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(start)
     if magic != MAGIC or not 1 <= version <= 4 or (version == 4) == packed:
         raise ValueError(f"an SPZ file starts with {MAGIC!r} and version 1 to 4, this one with {magic!r} and {version}")
     if degree > 3:
@@ -108,9 +111,20 @@ def _open(data: bytes) -> tuple[_Header, list[np.ndarray]]:
     if flags & HAS_EXTENSIONS:
         raise ValueError("it has extensions, which may change what its numbers mean; write it without them")
     header = _Header(version, count, degree, bits)
+    size = sum(header.sizes)
+    check_count(count, "it")
+    check_unpacked(size, len(data), "it")
     if version == 4:
         return header, _zstd_streams(data, header, streams)
-    return header, _cut(data[HEADER.size :], header)
+    return header, _cut(_unpacked(unpacker, size), header)
+
+
+def _unpacked(unpacker: Any, size: int) -> bytes:
+    """The body, and not more of what follows it than tells that its checksum is right."""
+    body: bytes = unpacker.decompress(unpacker.unconsumed_tail, size) if size else b""
+    if not unpacker.eof and len(body) == size:
+        unpacker.decompress(unpacker.unconsumed_tail, 1)
+    return body
 
 
 def _cut(body: bytes, header: _Header) -> list[np.ndarray]:

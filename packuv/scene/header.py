@@ -14,11 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from packuv import bounds
+from packuv.bounds import field as field_of
 from packuv.camera import PinholeCamera
+from packuv.files import parse_json
 from packuv.gaussians.codes import Codes, Quantizer
 from packuv.scene.matroska import VideoTrack
 from packuv.scene.mosaic import BLOCK, Mosaic
-from packuv.scene.stream import REPEAT, Tolerance, channel_names
+from packuv.scene.stream import LINEAR, REPEAT, Tolerance, channel_names
 
 FORMAT, VERSION, LAYOUT = "packuv-scene", 2, "compact"
 HEADER, CHECKSUM = "packuv.json", "packuv.sha256"
@@ -50,11 +53,18 @@ class SceneHeader:
     def __post_init__(self) -> None:
         if self.times_ns.dtype != np.int64 or self.times_ns.ndim != 1:
             raise ValueError(f"frame times must be int64 [T], but are {self.times_ns.dtype} {self.times_ns.shape}")
+        if len(self.times_ns) > bounds.MOST_FRAMES:
+            raise ValueError(f"a scene has at most {bounds.MOST_FRAMES} frames, but this one {len(self.times_ns)}")
+        if (self.times_ns > bounds.MOST_NS).any() or (self.times_ns < -bounds.MOST_NS).any():
+            raise ValueError(f"frame times must lie within {bounds.MOST_NS} ns of 0")
         if not self.rate > 0:
             raise ValueError(f"the frame rate must be positive, but is {self.rate}")
         unknown = set(self.held_out) - {camera.name for camera in self.cameras}
         if unknown:
             raise ValueError(f"held-out cameras {sorted(unknown)} are not among the scene's cameras")
+        near = self.extra.get("near")
+        if near is not None:
+            bounds.positive(near, "the scene's near plane, extra.near,")
         try:
             json.dumps([dict(self.sync), dict(self.extra)], allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -71,6 +81,11 @@ class SceneHeader:
         """Presentation times in the file, int64 [T]: milliseconds after the first frame."""
         milliseconds: np.ndarray = (self.times_ns - self.times_ns[:1] + 500_000) // 1_000_000
         return milliseconds
+
+    @property
+    def near(self) -> float:
+        """Depth before which nothing is drawn, world; raises ValueError where the scene does not say."""
+        return float(field_of(self.extra, "near", "the scene's header: extra"))
 
     def first(self, frames: int) -> SceneHeader:
         """The header of a scene that ends after so many frames."""
@@ -89,15 +104,24 @@ class SceneHeader:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> SceneHeader:
-        return cls(
-            Quantizer.from_json(data["quantizer"]),
-            np.asarray(data["times_ns"], dtype=np.int64),
-            Fraction(data["rate"]),
-            tuple(PinholeCamera.from_json(camera) for camera in data["cameras"]),
-            tuple(data["held_out"]),
-            data["sync"],
-            data["extra"],
+        what = "a scene's header"
+        quantizer, times, rate, cameras, held_out, sync, extra = (
+            field_of(data, name, what)
+            for name in ("quantizer", "times_ns", "rate", "cameras", "held_out", "sync", "extra")
         )
+        return cls(
+            Quantizer.from_json(quantizer),
+            np.array(bounds.wholes(times, "times_ns", least=-bounds.MOST_NS, most=bounds.MOST_NS), np.int64),
+            bounds.rate_of(rate, "rate"),
+            tuple(map(PinholeCamera.from_json, bounds.items(cameras, "cameras", most=bounds.MOST_CAMERAS))),
+            _texts(held_out, "held_out", most=bounds.MOST_CAMERAS),
+            bounds.fields(sync, "sync"),
+            bounds.fields(extra, "extra"),
+        )
+
+
+def _texts(value: object, what: str, *, most: int) -> tuple[str, ...]:
+    return tuple(bounds.words(item, what) for item in bounds.items(value, what, most=most))
 
 
 @dataclass(frozen=True)
@@ -123,6 +147,31 @@ class SegmentEntry:
     """Of each frame after the key: REPEAT (no packet), PREVIOUS or LINEAR"""
     differences: tuple[int, ...]
     """Of each frame after the key: 1 where colour residuals are stored as differences to green"""
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any], number: int) -> SegmentEntry:
+        what = f"segment {number}"
+        found = {item.name: field_of(bounds.fields(data, what), item.name, what) for item in fields(cls)}
+
+        def count(name: str, most: int) -> int:
+            return bounds.whole(found[name], f"{what}: {name}", most=most)
+
+        def steps(name: str, most: int) -> tuple[int, ...]:
+            return tuple(bounds.wholes(found[name], f"{what}: {name}", most=most, count=frames - 1))
+
+        frames = bounds.whole(found["frames"], f"{what}: frames", least=1, most=bounds.MOST_FRAMES)
+        return cls(
+            first=count("first", bounds.MOST_FRAMES),
+            frames=frames,
+            rows=count("rows", bounds.MOST_GAUSSIANS),
+            dynamic=count("dynamic", bounds.MOST_GAUSSIANS),
+            reference=None if found["reference"] is None else count("reference", bounds.MOST_FRAMES),
+            own=count("own", bounds.MOST_GAUSSIANS),
+            own_dynamic=count("own_dynamic", bounds.MOST_GAUSSIANS),
+            first_packet=count("first_packet", bounds.MOST_FRAMES),
+            predictions=steps("predictions", LINEAR),
+            differences=steps("differences", 1),
+        )
 
     def packet(self, step: int) -> int:
         """Packet of the frame `step` frames after the key; meaningless for REPEAT."""
@@ -167,20 +216,38 @@ class TrackEntry:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any], names: Sequence[str]) -> TrackEntry:
-        constants = np.zeros(len(names), np.uint8)
-        for name, value in data["constants"].items():
-            constants[names.index(name)] = value
-        planes = list(data["planes"])
+        title = bounds.words(field_of(bounds.fields(data, "a track"), "name", "a track"), "a track's name")
+        what = f"track {title!r}"
+        given = {name: field_of(data, name, what) for name in ("planes", "constants", "slices", "sizes", "crc32")}
+        planes = _texts(given["planes"], f"{what}: planes", most=len(names) + 1)
         flagged = bool(planes) and planes[-1] in FLAG_NAMES
-        channels = tuple(names.index(name) for name in planes[: len(planes) - flagged])
-        mosaic = Mosaic(channels, len(names), int(data["blocks_across"]), int(data["blocks_down"]), flagged)
-        stated = data["width"], data["height"], data["planes_across"], data["block"]
+        named, fixed = planes[: len(planes) - flagged], bounds.fields(given["constants"], f"{what}: constants")
+        if sorted((*named, *fixed)) != sorted(names):
+            raise ValueError(f"{what} must give every channel either a plane or a constant")
+        constants = np.zeros(len(names), np.uint8)
+        for name, value in fixed.items():
+            constants[names.index(name)] = bounds.whole(value, f"{what}: constant {name}", most=255)
+        return cls(
+            cls._mosaic(data, what, Mosaic(tuple(map(names.index, named)), len(names), 1, 1, flagged)),
+            constants,
+            bounds.whole(given["slices"], f"{what}: slices", least=1, most=1024),
+            tuple(bounds.wholes(given["sizes"], f"{what}: sizes", most=bounds.MOST_PIXELS)),
+            tuple(bounds.wholes(given["crc32"], f"{what}: crc32", most=2**32 - 1)),
+        )
+
+    @staticmethod
+    def _mosaic(data: Mapping[str, Any], what: str, planes: Mosaic) -> Mosaic:
+        """The layout of these planes that a track states."""
+        sides = {
+            name: bounds.whole(field_of(data, name, what), f"{what}: {name}", least=1, most=bounds.MOST_SIDE_PX)
+            for name in ("blocks_across", "blocks_down", "width", "height", "planes_across", "block")
+        }
+        bounds.check_picture(sides["width"], sides["height"], what)
+        mosaic = replace(planes, blocks_across=sides["blocks_across"], blocks_down=sides["blocks_down"])
+        stated = tuple(sides[name] for name in ("width", "height", "planes_across", "block"))
         if (mosaic.width, mosaic.height, mosaic.grid[0], BLOCK) != stated:
-            raise ValueError(f"track {data['name']!r} has an unknown picture layout")
-        if set(data["constants"]) != {names[k] for k in set(range(len(names))) - set(channels)}:
-            raise ValueError(f"track {data['name']!r} must give every channel either a plane or a constant")
-        lists = tuple(data["sizes"]), tuple(data["crc32"])
-        return cls(mosaic, constants, int(data["slices"]), *lists)
+            raise ValueError(f"{what} has an unknown picture layout")
+        return mosaic
 
 
 @dataclass(frozen=True)
@@ -205,11 +272,22 @@ class SceneIndex:
                 f"{frames} frames in segments, {len(self.header.times_ns)} times, {len(self.digests)} digests, "
                 f"{len(self.tracks)} tracks do not belong together"
             )
-        first = 0
+        first, depths = 0, list[int]()
         for number, segment in enumerate(self.segments):
+            depths.append(self._depth(segment, depths))
             if segment.first != first or not self._fits(number, segment):
                 raise ValueError(f"the segment at frame {segment.first} does not fit the scene's tracks")
             first += segment.frames
+
+    def _depth(self, segment: SegmentEntry, depths: Sequence[int]) -> int:
+        """Number of keys that a segment's key is made of, given those of the segments before it."""
+        if segment.reference is None or not 0 <= segment.reference < len(depths):
+            return 1  # the latter does not fit
+        if depths[segment.reference] == bounds.MOST_REFERENCES:
+            raise ValueError(
+                f"the key at frame {segment.first} is made of more than {bounds.MOST_REFERENCES} keys, one of another"
+            )
+        return depths[segment.reference] + 1
 
     def _fits(self, number: int, segment: SegmentEntry) -> bool:
         key, mosaic = self.tracks[KEY], self.tracks[KEY].mosaic
@@ -247,27 +325,44 @@ class SceneIndex:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> SceneIndex:
-        if data["format"] != FORMAT or data["version"] != VERSION or data["layout"] != LAYOUT:
+        kind, version, layout = (
+            field_of(bounds.fields(data, HEADER), name, "it") for name in ("format", "version", "layout")
+        )
+        if (kind, version, layout) != (FORMAT, VERSION, LAYOUT):
+            said = [bounds.shown(value).strip("'") for value in (kind, version, layout)]
             raise ValueError(
-                f"it is {data['format']} version {data['version']}, layout {data['layout']}; this program reads "
+                f"it is {said[0]} version {said[1]}, layout {said[2]}; this program reads "
                 f"{FORMAT} version {VERSION}, layout {LAYOUT}"
             )
-        names = list(channel_names(int(data["quantizer"]["sh_degree"])))
-        known = {item.name for item in fields(SegmentEntry)}
-        segments = [{name: value for name, value in s.items() if name in known} for s in data["segments"]]
-        lists = ("predictions", "differences")
+        header = SceneHeader.from_json(data)
+        names = list(channel_names(header.quantizer.sh_degree))
+        tracks, segments, digests, tools = (
+            field_of(data, name, "a scene's header") for name in ("tracks", "segments", "digests", "tools")
+        )
+        most = bounds.MOST_FRAMES
         return cls(
-            SceneHeader.from_json(data),
-            Tolerance(data["tolerance"]["position"], data["tolerance"]["attribute"]),
-            tuple(TrackEntry.from_json(track, names) for track in data["tracks"]),
-            tuple(SegmentEntry(**{**s, **{name: tuple(s[name]) for name in lists}}) for s in segments),
-            tuple(data["digests"]),
-            data["tools"],
+            header,
+            _tolerance(field_of(data, "tolerance", "a scene's header")),
+            tuple(TrackEntry.from_json(track, names) for track in bounds.items(tracks, "tracks", most=2)),
+            tuple(
+                SegmentEntry.from_json(segment, number)
+                for number, segment in enumerate(bounds.items(segments, "segments", most=most))
+            ),
+            _texts(digests, "digests", most=most),
+            {
+                bounds.words(name, "tools"): bounds.words(value, f"tools: {name}")
+                for name, value in bounds.fields(tools, "tools").items()
+            },
         )
 
     def encode(self) -> dict[str, tuple[str, bytes]]:
         """The attachments of the file: name -> MIME type, content."""
         document = json.dumps(self.to_json(), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+        if len(document) > bounds.MOST_JSON_BYTES:
+            raise ValueError(
+                f"a scene's header has at most {bounds.MOST_JSON_BYTES} bytes, but this one {len(document)}; "
+                "write fewer frames, or less extra"
+            )
         checksum = f"{hashlib.sha256(document).hexdigest()}  {HEADER}\n".encode()
         return {HEADER: ("application/json", document), CHECKSUM: ("text/plain", checksum)}
 
@@ -278,14 +373,24 @@ class SceneIndex:
             if name not in attachments:
                 raise ValueError(f"it is not a whole PackUV scene, it lacks the attachment {name}")
         document = attachments[HEADER]
-        if attachments[CHECKSUM].decode(errors="replace").split() != [hashlib.sha256(document).hexdigest(), HEADER]:
+        if attachments[CHECKSUM][:200].decode(errors="replace").split() != [
+            hashlib.sha256(document).hexdigest(),
+            HEADER,
+        ]:
             raise ValueError(f"its header {HEADER} is damaged, it does not match {CHECKSUM}")
         try:
-            return cls.from_json(json.loads(document))
-        except (KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
-            raise ValueError(f"its header {HEADER} lacks or misuses a field ({error!r})") from None
+            return cls.from_json(parse_json(document, "it"))
         except ValueError as error:
             raise ValueError(f"its header {HEADER} cannot be read: {error}") from None
+
+
+def _tolerance(data: object) -> Tolerance:
+    found = bounds.fields(data, "tolerance")
+    position, attribute = (
+        bounds.whole(field_of(found, name, "tolerance"), f"tolerance: {name}", most=65535)
+        for name in ("position", "attribute")
+    )
+    return Tolerance(position, attribute)
 
 
 def codes_digest(codes: Codes) -> str:

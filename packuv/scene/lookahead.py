@@ -19,6 +19,9 @@ import numpy as np
 from packuv.scene.header import TRACK_NAMES, SceneIndex
 from packuv.scene.matroska import Decoder, FoundPacket, Reader
 
+MOST_PIXELS_A_BYTE = 256
+"""Of a packet; FFV1's range coder gets a picture of one grey to 98"""
+
 
 @dataclass(frozen=True)
 class Address:
@@ -100,6 +103,8 @@ class LookAhead:
         expected = entry.sizes[address.packet], entry.crc32[address.packet]
         if (len(found.data), zlib.crc32(found.data)) != expected:
             raise self._damage("differs from what was written", address, found)
+        if entry.mosaic.width * entry.mosaic.height > MOST_PIXELS_A_BYTE * len(found.data):
+            raise self._damage("is too small for its picture", address, found)
         try:
             picture = self._decoder(address.track).decode(found.data)
         except ValueError as error:

@@ -16,6 +16,8 @@ from typing import Any, BinaryIO
 import av
 import numpy as np
 
+from packuv.bounds import MOST_JSON_BYTES, MOST_PIXELS
+
 TIME_BASE = Fraction(1, 1000)
 MAGIC = b"\x1a\x45\xdf\xa3"
 """First bytes of every EBML file."""
@@ -77,6 +79,7 @@ class Decoder:
         self._context = av.CodecContext.create("ffv1", "r")
         assert isinstance(self._context, av.VideoCodecContext)
         self._context.extradata = extradata
+        self._context.options = {"max_pixels": str(MOST_PIXELS)}
         self._context.width, self._context.height = track.width, track.height
         self._context.thread_count = 1
 
@@ -177,6 +180,12 @@ class FoundPacket:
         return self.position + before, self.position + before + len(self.data)
 
 
+def open_matroska(path: Path) -> av.container.InputContainer:
+    """A Matroska file whose pictures FFmpeg's decoders refuse beyond MOST_PIXELS; raises av.FFmpegError."""
+    options = {"max_pixels": str(MOST_PIXELS)}
+    return av.open(str(path), format="matroska", metadata_errors="replace", options=options)
+
+
 class Reader:
     """Packets by track and time; one reader for one thread.
 
@@ -190,7 +199,7 @@ class Reader:
             if file.read(4) != MAGIC:
                 raise ValueError(f"{path} is not a Matroska file")
         try:
-            self._container = av.open(str(path), format="matroska", metadata_errors="replace")
+            self._container = open_matroska(self._path)
         except av.FFmpegError as error:
             raise ValueError(f"{path}: its Matroska header is damaged or cut short ({error.strerror})") from None
         for number, stream in enumerate(self._container.streams.video):
@@ -214,7 +223,14 @@ class Reader:
 
     @property
     def attachments(self) -> dict[str, bytes]:
-        return {stream.name or "": stream.data or b"" for stream in self._container.streams.attachments}
+        """Name and content; raises ValueError for one that is too large for a header."""
+        found = {stream.name or "": stream.data or b"" for stream in self._container.streams.attachments}
+        for name, content in found.items():
+            if len(content) > MOST_JSON_BYTES:
+                raise ValueError(
+                    f"its attachment {name!r} has {len(content)} bytes, but {MOST_JSON_BYTES} is the most for a header"
+                )
+        return found
 
     def read(self, track: int, time_ms: int) -> FoundPacket:
         """The packet of a track at a time. Reading in the order of the file costs no seek."""

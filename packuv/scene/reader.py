@@ -139,8 +139,10 @@ class Scene:
 
     def _way(self, number: int) -> list[int]:
         """Segments whose key pictures a segment's key is made of, from the root to itself."""
-        reference = self.index.segments[number].reference
-        return [number] if reference is None else [*self._way(reference), number]
+        way = [number]
+        while (reference := self.index.segments[way[-1]].reference) is not None:
+            way.append(reference)
+        return way[::-1]
 
     def _load_key(self, number: int, picture: np.ndarray) -> Codes:
         """A segment's key from its own picture and the key that it refers to."""

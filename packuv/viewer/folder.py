@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from packuv.files import whole_folder
+from packuv.bounds import field, fields
+from packuv.files import load_json, whole_folder
 from packuv.gaussians.codes import Codes, attribute_count
 from packuv.progress import Progress, no_progress
 from packuv.scene import Scene, open_scene
@@ -212,10 +213,10 @@ def read_deltas(folder: Path) -> Iterator[Codes]:
 def read_index(folder: Path) -> dict[str, Any]:
     """index.json of a folder for the web; raises FileNotFoundError, or ValueError for another one."""
     try:
-        index: dict[str, Any] = json.loads((folder / INDEX).read_text())
-        known = (index["format"], index["version"]) == (FORMAT, VERSION)
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder / INDEX} is no index of a scene: {error!r}") from None
+        index = dict(fields(load_json(folder / INDEX), "it"))
+        known = (field(index, "format", "it"), field(index, "version", "it")) == (FORMAT, VERSION)
+    except ValueError as error:
+        raise ValueError(f"{folder / INDEX} is no index of a scene: {error}") from None
     if not known:
         raise ValueError(f"{folder / INDEX} is {index['format']} version {index['version']}, not {FORMAT} {VERSION}")
     return index

@@ -6,7 +6,6 @@ What turns scenes into other programs' files, or those into scenes, is in `pipel
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -149,7 +148,9 @@ def render(arguments: argparse.Namespace) -> int:
 
 def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
     """A camera of the scene by name, or one from a JSON file in the scene's own form."""
+    from packuv.bounds import fields
     from packuv.camera import PinholeCamera
+    from packuv.files import load_json
 
     for camera in known:
         if camera.name == name:
@@ -158,8 +159,9 @@ def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
         names = ", ".join(camera.name for camera in known)
         raise ValueError(f"{name!r} is neither a camera of the scene nor a file; the scene has {names}")
     try:
-        return PinholeCamera.from_json({"name": Path(name).stem, **json.loads(Path(name).read_text())})
-    except (json.JSONDecodeError, TypeError) as error:
+        said = fields(load_json(Path(name)), "a camera")
+        return PinholeCamera.from_json({"name": Path(name).stem, **said})
+    except ValueError as error:
         raise ValueError(f"{name} is no camera in JSON: {error}") from None
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from packuv.bounds import MOST_CAMERAS, MOST_NS, MOST_SIDE_PX, field, items, whole
 from packuv.files import save_json
 from packuv.footage import LensCamera, Transfer, Views
 from packuv.progress import Progress
@@ -76,7 +77,7 @@ def evaluate_scene(
     """
     with open_scene(scene) as opened:
         header = opened.header
-        lenses = {item["name"]: LensCamera.from_json(item) for item in header.extra["lenses"]}
+        lenses = _lenses(header.extra)
         fitted = [name for name in lenses if name not in header.held_out]
         names = tuple(cameras or header.held_out) or spread(fitted, options.fitted_cameras)
         if unknown := [name for name in names if name not in lenses]:
@@ -90,19 +91,32 @@ def evaluate_scene(
             find_capture(capture).videos,
             frames,
             [lenses[name] for name in names],
-            max_width=header.extra["max_width"],
+            max_width=_max_width(header.extra),
             transfer=Transfer(said) if said else None,
         )
         scores = score(opened, views, progress)
         return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
 
 
+def _lenses(extra: Mapping[str, Any]) -> dict[str, LensCamera]:
+    """The scene's cameras as they film, by name."""
+    listed = items(field(extra, "lenses", "the scene's header: extra"), "extra: lenses", most=MOST_CAMERAS)
+    return {lens.pinhole.name: lens for lens in map(LensCamera.from_json, listed)}
+
+
+def _max_width(extra: Mapping[str, Any]) -> int | None:
+    said = field(extra, "max_width", "the scene's header: extra")
+    return None if said is None else whole(said, "extra: max_width", least=1, most=MOST_SIDE_PX)
+
+
 def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
     found = find_capture(capture)
     infos = {camera: probe_video(path) for camera, path in found.videos.items()}
-    options = AlignOptions(
-        reference=sync["reference"], tolerance_ns=sync["tolerance_ns"], clock=ClockMode(sync["clock"])
-    )
+    what = "the scene's header: sync"
+    reference, tolerance_ns, clock = (field(sync, name, what) for name in ("reference", "tolerance_ns", "clock"))
+    if tolerance_ns is not None:
+        tolerance_ns = whole(tolerance_ns, f"{what}: tolerance_ns", most=MOST_NS)
+    options = AlignOptions(reference=reference, tolerance_ns=tolerance_ns, clock=ClockMode(clock))
     return align(load_timecodes(found, infos), options)[0]
 
 
