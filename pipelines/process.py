@@ -123,19 +123,9 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     Raises ValueError or FileNotFoundError for bad input, OSError when the disk cannot hold the results, CancelledError
     when the jobs are cancelled, and what a failing stage raises. Whatever ends the run, no job goes on after it.
     """
-    started = datetime.now(UTC)
-    capture = find_sequence(request)
-    options = compose(request.preset, capture.settings, request.settings, seed=request.seed, quality=request.quality)
-    plan = plan_of(request, capture)
-    options = replace(options, fit=replace(options.fit, device=plan.device))
-    folder = Path(request.out) / capture.name
-    claim(folder, capture)
+    sequence, run = prepare(request, journal, engine, jobs)
+    folder, workshop = run.workshop.store.root.parent, run.workshop
     bury(folder, engine.crashed)
-    originals = Originals(capture, folder / "file_digests.json")
-    workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
-    lender = lender_of(request, capture, workshop, engine.submitter)
-    sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), lender, engine.watched)
-    run = Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
     on_record = registered(
         folder, sequence=run.name, capture=request.capture, preset=request.preset, engine=engine.place
     )
@@ -153,6 +143,45 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
             raise
         write_json(folder / RUN, run_json(run, Ending("finished")))
         return outcome
+
+
+def is_made(request: RunRequest) -> bool:
+    """Whether every artefact of the run is there, so that nobody is needed to make one."""
+    jobs = jobs_of(request)
+    jobs.cancel("only looking")
+    try:
+        prepare(request, Journal(), Engine(lambda make: lambda stage: There(make(stage))), jobs)[0].run(
+            request.stop_after
+        )
+    except Exception:  # whatever it is, the run itself meets it again
+        return False
+    return True
+
+
+@dataclass(frozen=True)
+class There:
+    """A `pipelines.chain.Future` of what is there."""
+
+    key: Key
+
+    def result(self) -> Key:
+        return self.key
+
+
+def prepare(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -> tuple[Sequence, Run]:
+    """The stages of a run, and what it leaves; its folder is there and belongs to the capture."""
+    started = datetime.now(UTC)
+    capture = find_sequence(request)
+    options = compose(request.preset, capture.settings, request.settings, seed=request.seed, quality=request.quality)
+    plan = plan_of(request, capture)
+    options = replace(options, fit=replace(options.fit, device=plan.device))
+    folder = Path(request.out) / capture.name
+    claim(folder, capture)
+    originals = Originals(capture, folder / "file_digests.json")
+    workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
+    lender = lender_of(request, capture, workshop, engine.submitter)
+    sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), lender, engine.watched)
+    return sequence, Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
 
 
 def find_sequence(request: RunRequest) -> Capture:

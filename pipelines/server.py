@@ -168,6 +168,11 @@ def named_server() -> Server | None:
     return Server(address.rstrip("/")) if address else None
 
 
+def brings_server(out: Path) -> bool:
+    """Whether a run into this folder has no server to tell, and would start one."""
+    return named_server() is None and find_served(out) is None
+
+
 def results_url(path: Path) -> str:
     """A link to a file of results that a dashboard can show: by our server, where it hands out that folder."""
     url, _, root = os.environ.get(RESULTS_VARIABLE, "").partition(" ")
