@@ -79,7 +79,7 @@ def run(request: RunRequest, journal: Journal, *, direct: bool) -> Outcome:
 def _came_to_its_end(request: RunRequest) -> bool:
     """Whether the last run into one of the folders was this one, and finished; cost: reading a small file for each."""
     for path in Path(request.out).glob("*/run.json"):
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError, KeyError):  # of another version
             last = json.loads(path.read_text())
             if last["request"] == plain(request) and last["outcome"] == "finished":
                 return True

@@ -130,6 +130,19 @@ def test_same_command_finds_everything_there(first, capture):
     assert sha256(again.scene) == before
 
 
+def test_a_finished_sequence_needs_no_workflow_engine(first, capture, monkeypatch):
+    from pipelines.commands import run as command
+
+    asked = request(capture, first[0].folder.parent)
+    run(asked)
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    monkeypatch.setattr(command, "workflow_server", lambda out: pytest.fail("it starts a server"))
+    again = command.run(asked, Journal(), direct=False)
+    assert made(again) == set()
+    with pytest.raises(pytest.fail.Exception, match="it starts a server"):
+        command.run(request(capture, first[0].folder.parent, seed=1), Journal(), direct=False)
+
+
 def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
     outcome, _ = first
     out = outcome.folder.parent
