@@ -104,7 +104,12 @@ def _open(data: bytes) -> tuple[_Header, list[np.ndarray]]:
     unpacker = zlib.decompressobj(wbits=31)
     start = unpacker.decompress(data, HEADER.size) if packed else data
     magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(start)
-    if magic != MAGIC or not 1 <= version <= 4 or (version == 4) == packed:
+    if magic == MAGIC and 1 <= version <= 4 and (version == 4) == packed:
+        form = "one gzip stream" if version < 4 else "a plain header and streams of zstd"
+        raise ValueError(
+            f"SPZ of version {version} is {form}, but this file is {'' if packed else 'not '}packed by gzip"
+        )
+    if magic != MAGIC or not 1 <= version <= 4:
         raise ValueError(f"an SPZ file starts with {MAGIC!r} and version 1 to 4, this one with {magic!r} and {version}")
     if degree > 3:
         raise ValueError(f"it has SH of degree {degree}, but a scene holds 3 at most; convert it to a lower degree")

@@ -254,6 +254,13 @@ def test_what_it_cannot_hold_is_said(tmp_path):
             read_gaussians(tmp_path / "b.spz")
 
 
+def test_a_file_that_is_not_packed_as_its_version_says_is_told_so(tmp_path):
+    header, streams = stored_streams(random_gaussians(2, 0), tmp_path / "a.spz")
+    (tmp_path / "b.spz").write_bytes(header + b"".join(streams))
+    with pytest.raises(ValueError, match="version 3 is one gzip stream, but this file is not packed by gzip"):
+        read_gaussians(tmp_path / "b.spz")
+
+
 @needs_data(SPLATS)
 def test_one_scene_in_two_formats_is_one_scene():
     """biker.spz (version 4) and biker.compressed.ply were made from one training, row by row."""
