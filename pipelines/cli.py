@@ -192,6 +192,9 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     )
     for name, text in SINGLE.items():
         _run(command(name, "pipelines.commands.run:command", f"{text} (run --stop-after {name})"), stop=False)
+    _manifest(
+        command("manifest", "pipelines.commands.datasets:manifest", "list the captures of a data set in a Parquet file")
+    )
     _scene(command("info", "pipelines.commands.scenes:info", "show what a scene file holds"), json=True)
     _verify(
         command(
@@ -273,6 +276,12 @@ def _status(command: argparse.ArgumentParser) -> None:
 def _cancel(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="output folder, or that of one sequence")
     command.add_argument("sequence", nargs="*", metavar="SEQUENCE", help="only these (all that run)")
+
+
+def _manifest(command: argparse.ArgumentParser) -> None:
+    command.add_argument("dataset", type=Path, metavar="DATASET", help="folder with capture folders in it")
+    _output(command, "FILE", "Parquet file to write, or to bring up to date")
+    _json(command)
 
 
 def _scene(command: argparse.ArgumentParser, *, json: bool = False) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -28,6 +29,10 @@ SIDECAR_SUFFIXES = frozenset(
     | {".srt", ".thm", ".toml", ".txt", ".wav", ".xml", ".yaml", ".yml"}
 )
 """Files beside the videos that are not taken for one. All else is, for FFmpeg reads more than a list can name."""
+LETTERS = frozenset({"Lu", "Ll", "Lt", "Lm", "Lo", "Mn", "Mc", "Nd"})
+"""Unicode's categories of letters, of the marks that belong to them, and of digits"""
+LONGEST_NAME, LONGEST_NAME_BYTES = 100, 200
+"""Of a sequence or a camera, in characters and in UTF-8: names of files are made of it, which end at 255 bytes"""
 
 
 @dataclass(frozen=True)
@@ -112,7 +117,7 @@ def find_capture(folder: Path) -> Capture:
     timecodes = _find_timecodes(folder, videos)
     return Capture(
         folder=folder,
-        name=settings.name or folder.resolve().name,
+        name=_name(folder, settings),
         videos=kept,
         timecodes={camera: timecodes[camera] for camera in kept if camera in timecodes},
         calibration=_find_calibration(folder, settings.calibration),
@@ -134,7 +139,19 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
     """
     if not capture.timecodes:
         return {camera: container_timecodes(infos[camera]) for camera in capture.cameras}
-    lacking = [camera for camera in capture.cameras if camera not in capture.timecodes]
+    return file_timecodes(capture, {camera: infos[camera].frame_count for camera in capture.cameras})
+
+
+def file_timecodes(capture: Capture, frames: Mapping[str, int]) -> dict[str, Timecodes]:
+    """Timecodes of these cameras from their files, numbered by the frames of their videos.
+
+    Args:
+        frames: how many the video has, by camera.
+
+    Raises:
+        ValueError: as `load_timecodes`.
+    """
+    lacking = [camera for camera in frames if camera not in capture.timecodes]
     if lacking:
         raise ValueError(
             f"{capture.folder / 'timecodes'} has no file for {lacking}, though it has for others; "
@@ -146,10 +163,31 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
         read = read_shared_timecodes(paths.pop(), capture.cameras, rate=settings.fps, column=settings.timecode_column)
     else:
         read = {
-            camera: read_timecodes(path, camera=camera, rate=settings.fps, column=settings.timecode_column)
-            for camera, path in capture.timecodes.items()
+            camera: read_timecodes(
+                capture.timecodes[camera], camera=camera, rate=settings.fps, column=settings.timecode_column
+            )
+            for camera in frames
         }
-    return {camera: codes.numbered(infos[camera].frame_count, camera=camera) for camera, codes in read.items()}
+    return {camera: read[camera].numbered(count, camera=camera) for camera, count in frames.items()}
+
+
+def check_name(name: str) -> str:
+    """The name of a sequence, which becomes that of a folder.
+
+    >>> check_name("take 2 (Mariä)")
+    'take 2 (Mariä)'
+
+    Raises:
+        ValueError: it could lead out of that folder, hide it, or be refused by a file system.
+    """
+    # marks follow the letters of many scripts, and those of others where macOS takes letters apart
+    fits = all(character in " ._-()+" or unicodedata.category(character) in LETTERS for character in name)
+    if not (fits and name[:1].isalnum() and name[-1] not in " ." and _is_short(name)):
+        raise ValueError(
+            f"a sequence's name must have 1 to {LONGEST_NAME} letters, digits, spaces and any of . _ - ( ) +, begin "
+            f"with a letter or digit and end with no dot or space, but is {name!r}"
+        )
+    return name
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
@@ -162,12 +200,32 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), part) if part[0].isdecimal() else (1, 0, part) for part in parts)
 
 
+def _name(folder: Path, settings: CaptureSettings) -> str:
+    try:
+        return check_name(folder.resolve().name if settings.name is None else settings.name)
+    except ValueError as error:
+        source = ", the folder's; set 'name'" if settings.name is None else "; change 'name'"
+        raise ValueError(f"{error}{source} in {folder / SETTINGS}") from None
+
+
+def _is_short(name: str) -> bool:
+    return len(name) <= LONGEST_NAME and len(name.encode("utf-8", "surrogatepass")) <= LONGEST_NAME_BYTES
+
+
 def _find_videos(folder: Path) -> dict[str, Path]:
     inside = folder / "videos"
     if not inside.is_dir():
         raise ValueError(f"{folder} is no capture: it must have a folder 'videos' with one file per camera")
     files = [path for path in inside.iterdir() if path.is_file() and not path.name.startswith(".")]
-    return _by_camera(inside, [path for path in files if path.suffix.lower() not in SIDECAR_SUFFIXES])
+    videos = _by_camera(inside, [path for path in files if path.suffix.lower() not in SIDECAR_SUFFIXES])
+    for camera in videos:
+        # a line break would be lines of its own in a COLMAP model, an escape sequence a command to the terminal
+        if not (camera.isprintable() and camera.strip() == camera and _is_short(camera)):
+            raise ValueError(
+                f"a camera's name must have 1 to {LONGEST_NAME} printable characters and no space at its ends, but is "
+                f"{camera!r}, that of a video in {inside}; rename the video"
+            )
+    return videos
 
 
 def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]:
@@ -253,7 +311,3 @@ def _checked(path: Path, key: str, value: Any) -> Any:
 def _suggest(name: str, known: Iterable[str]) -> str:
     close = get_close_matches(name, list(known), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
-
-
-def check_name(name: str) -> str:
-    return name

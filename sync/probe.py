@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -86,6 +87,15 @@ class VideoInfo:
             raise ValueError(f"{self.frame_count} frames need as many times, but there are {self.pts_ns.shape}")
 
 
+class _Packet(NamedTuple):
+    """What is kept of a packet: its bytes would be the whole file in memory."""
+
+    pts: int | None
+    duration: int
+    is_corrupt: bool
+    is_discard: bool
+
+
 def probe_video(path: Path) -> VideoInfo:
     """Count the frames of a video and read their times.
 
@@ -124,7 +134,11 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         raise ValueError(f"{path} holds no video ({name})")
     if name in STREAM_FORMATS:
         raise ValueError(f"{path} is a stream ({name}) in which frames cannot be sought exactly; {_remedy(path, name)}")
-    packets = [packet for packet in container.demux(stream) if packet.size]
+    packets = [
+        _Packet(packet.pts, packet.duration or 0, packet.is_corrupt, packet.is_discard)
+        for packet in container.demux(stream)
+        if packet.size
+    ]
     _check_whole(path, container, stream, packets)
     pts = np.sort(np.array(_presentation_times(path, name, stream, packets), dtype=np.int64))
     assert stream.time_base is not None
@@ -148,7 +162,7 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
 
 
 def _check_whole(
-    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: list[av.Packet[av.VideoStream]]
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: list[_Packet]
 ) -> None:
     if not packets:
         raise ValueError(f"{path} holds no frames; copy the recording again")
@@ -165,9 +179,7 @@ def _check_whole(
         )
 
 
-def _presentation_times(
-    path: Path, name: str, stream: av.VideoStream, packets: list[av.Packet[av.VideoStream]]
-) -> list[int]:
+def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: list[_Packet]) -> list[int]:
     hidden = sum(packet.is_discard for packet in packets)
     if hidden:
         raise ValueError(
@@ -201,9 +213,9 @@ def _declared_end_s(stream: av.VideoStream) -> Fraction | None:
     return sum((Fraction(part) * 60**power for power, part in zip((2, 1, 0), parts, strict=True)), Fraction(0))
 
 
-def _found_end_s(stream: av.VideoStream, packets: list[av.Packet[av.VideoStream]]) -> Fraction:
+def _found_end_s(stream: av.VideoStream, packets: list[_Packet]) -> Fraction:
     assert stream.time_base is not None
-    last = max((packet.pts or 0) + (packet.duration or 0) for packet in packets)
+    last = max((packet.pts or 0) + packet.duration for packet in packets)
     return last * stream.time_base
 
 

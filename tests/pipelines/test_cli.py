@@ -65,7 +65,7 @@ def test_wrong_usage_is_one_sentence_and_code_2(arguments, message, capsys, tmp_
     [
         "",
         *cli.SINGLE,
-        *("run", "simulate", "info", "verify", "render", "eval", "view", "import", "atlas", "web"),
+        *("run", "simulate", "info", "verify", "render", "eval", "view", "import", "atlas", "web", "manifest"),
         *("export", "export frames", "export cameras", "export atlas"),
     ],
 )

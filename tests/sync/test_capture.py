@@ -1,14 +1,17 @@
 """Capture folders: what is found in them, and what is said about those that do not work."""
 
 import doctest
+import unicodedata
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import sync.capture
-from sync.capture import CaptureSettings, find_capture, load_timecodes
+from sync.capture import CaptureSettings, check_name, find_capture, load_timecodes
 from sync.clock import ClockMode
 from sync.probe import ColourTags, VideoInfo
 
@@ -110,6 +113,95 @@ def test_folders_that_are_no_capture(tmp_path: Path) -> None:
         find_capture(make_capture(tmp_path, "videos/cam1.mp4"))
     with pytest.raises(ValueError, match=r"two files for 'cam1': cam1\.mkv and cam1\.mp4"):
         find_capture(make_capture(tmp_path, "videos/cam1.mkv"))
+
+
+# Names
+
+GOOD_NAMES = ("dance", "7", "take 2 (b)", "a.b_c-d+e", "танец", "नृत्य", "舞" * 66, "Mari\u0061\u0308", "x" * 100)
+BAD_NAMES = (
+    "",
+    ".",
+    "..",
+    "../../escaped",
+    "/etc",
+    "a/b",
+    "a\\b",
+    "a\0b",
+    "a\nb",
+    "\x1b[2J",
+    ".hidden",
+    "_a",
+    "-rf",
+    "a.",
+    "a ",
+)
+BAD_NAMES += (
+    " a",
+    "x" * 101,
+    "舞" * 67,
+    "\u0308a",
+    "a\u202eb",
+    "a\u200bb",
+    "\udcff",
+    "c:",
+    "a*",
+    "a?b",
+    "a#b",
+    "²",
+    "a\u2028",
+)
+
+
+@pytest.mark.parametrize("name", GOOD_NAMES)
+def test_names_of_sequences(tmp_path: Path, name: str) -> None:
+    assert check_name(name) == name
+    assert find_capture(make_capture(tmp_path / name, *VIDEOS)).name == name
+    assert find_capture(make_capture(tmp_path / "b", *VIDEOS, settings=f'name = "{name}"')).name == name
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_names_that_sequences_must_not_have(name: str) -> None:
+    with pytest.raises(ValueError, match="a sequence's name must have 1 to 100 letters, digits, spaces and"):
+        check_name(name)
+
+
+@given(st.text(max_size=120))
+def test_a_name_that_passes_is_one_visible_folder(name: str) -> None:
+    try:
+        check_name(name)
+    except ValueError:
+        return
+    path = Path("out") / name
+    assert path.parent == Path("out")
+    assert path.name == name
+    assert not name.startswith((".", "-"))
+    assert not any(unicodedata.category(character)[0] in "CZ" for character in name.replace(" ", ""))
+    assert len(name.encode()) <= 200
+
+
+def test_a_bad_name_says_where_it_comes_from(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"but is '#1', the folder's; set 'name' in .*#1/capture\.toml$"):
+        find_capture(make_capture(tmp_path / "#1", *VIDEOS))
+    with pytest.raises(ValueError, match=r"but is '\.\./x'; change 'name' in .*capture\.toml$"):
+        find_capture(make_capture(tmp_path / "a", *VIDEOS, settings="name = '../x'"))
+
+
+@pytest.mark.parametrize("camera", ["a\nb", "\x1b[2J", " a", "a ", "\udcff", "a\u202eb", "x" * 101, "舞" * 67])
+def test_names_that_cameras_must_not_have(tmp_path: Path, camera: str) -> None:
+    with pytest.raises(ValueError, match="a camera's name must have 1 to 100 printable characters") as error:
+        find_capture(make_capture(tmp_path, *VIDEOS, f"videos/{camera}.mp4"))
+    assert str(error.value).isprintable()
+
+
+@pytest.mark.parametrize("camera", ["..a", "-i", "a\\b", "%03d", "<b>", "a#b?c", "cam 1", "$(reboot)", "x" * 100])
+def test_names_of_cameras_stay_names_of_files(tmp_path: Path, camera: str) -> None:
+    """A stem has no slash, so what is made of it lies in the folder where it is made; hidden files are passed over."""
+    cameras = find_capture(make_capture(tmp_path, *VIDEOS, f"videos/{camera}.mp4")).cameras
+    assert set(cameras) == {"cam1", "cam2", "cam10"} | ({camera} if camera[0] != "." else set())
+    for name in cameras:
+        for file in (f"{name}.avl", f"{name}.steps.npy", f"{name}_000000_render.png"):
+            (tmp_path / file).touch()
+            assert (tmp_path / file).parent == tmp_path
 
 
 # Timecodes
