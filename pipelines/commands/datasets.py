@@ -10,8 +10,9 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from pipelines.commands.terminal import print_facts, print_table, shown, size_text
+from pipelines.commands.terminal import print_facts, print_table, shown
 from pipelines.dataset import survey
+from pipelines.disk import size_text
 from pipelines.manifest import Entry, Manifest, Row, update
 from pipelines.words import duration
 

@@ -145,7 +145,7 @@ def _measure_here() -> Found:
             steps.append(stage)
             return Done(make(stage))
 
-        sequence = Sequence(workshop, plan, options, submit, Made())
+        sequence = Sequence(workshop, plan, options, submit, Made(), watched=True)
         sequence.run("report")
         segment = sequence.made.keys["segment"][0]
         make(CutSegment(segment=segment, frames=2))

@@ -1,0 +1,39 @@
+"""A folder of results belongs to one capture."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pipelines.folder import claim
+from sync.capture import find_capture
+
+
+def _capture(folder: Path, size: int = 10) -> Path:
+    (folder / "videos").mkdir(parents=True)
+    for name in ("cam1", "cam2"):
+        (folder / "videos" / f"{name}.mp4").write_bytes(b"x" * size)
+    return folder
+
+
+def test_another_capture_of_the_same_name_is_refused_though_it_holds_the_same(tmp_path):
+    one, two = (_capture(tmp_path / day / "dance") for day in ("day1", "day2"))
+    results = tmp_path / "runs" / "dance"
+    claim(results, find_capture(one))
+    claim(results, find_capture(one))
+    with pytest.raises(ValueError, match=r"holds the results of .*day1/dance, but this .*day2/dance; choose"):
+        claim(results, find_capture(two))
+
+
+def test_a_capture_that_was_moved_keeps_its_results(tmp_path):
+    one, results = _capture(tmp_path / "day1" / "dance"), tmp_path / "runs" / "dance"
+    claim(results, find_capture(one))
+    moved = tmp_path / "archive" / "dance"
+    shutil.move(one, moved)
+    claim(results, find_capture(moved))
+    other = _capture(tmp_path / "elsewhere" / "dance", size=11)
+    shutil.rmtree(moved)
+    with pytest.raises(ValueError, match=r"holds the results of .*archive/dance"):
+        claim(results, find_capture(other))
