@@ -28,7 +28,7 @@ from pipelines import plugins
 from pipelines.commands.output import check_written, lasting_output
 from pipelines.disk import free_bytes, size_text
 from pipelines.ending import Terminated, ending_gently
-from pipelines.request import PRESETS, QUALITIES, STAGES, parse_range
+from pipelines.request import BAD_INPUT, PRESETS, QUALITIES, STAGES, parse_range
 from tasks.artefacts.jobs import CancelledError
 
 OK, FAILED, WRONG, INTERRUPTED = 0, 1, 2, 130
@@ -40,7 +40,6 @@ SINGLE = {
     "encode": "write the scene file",
 }
 """Commands that run the stages up to the one they name"""
-BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
 WRONG_PATH = frozenset({errno.ENAMETOOLONG, errno.ELOOP})
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
@@ -195,6 +194,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _manifest(
         command("manifest", "pipelines.commands.datasets:manifest", "list the captures of a data set in a Parquet file")
     )
+    _batch(command("batch", "pipelines.commands.batch:command", "process every sequence of a manifest"))
     _scene(command("info", "pipelines.commands.scenes:info", "show what a scene file holds"), json=True)
     _verify(
         command(
@@ -232,12 +232,6 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
     command.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/")
     command.add_argument("--name", default=None, help="of the sequence (what capture.toml or the folder says)")
-    command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
-    command.add_argument("--quality", choices=QUALITIES, default="lossless", help="how near the file stays to the fit")
-    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what fits and renders")
-    command.add_argument(
-        "--frames", type=_range_text, default=":", metavar="A:B", help="instants A to B - 1, counted from 0 (all)"
-    )
     command.add_argument(
         "--hold-out",
         type=_names,
@@ -245,9 +239,42 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
         metavar="CAM,CAM",
         help="cameras to score on, never fitted (capture.toml)",
     )
+    command.add_argument("--jobs", type=_positive, default=None, metavar="N", help="segments at once (from the cores)")
+    _how(command, stop=stop)
+
+
+def _batch(command: argparse.ArgumentParser) -> None:
+    command.add_argument("manifest", type=Path, metavar="MANIFEST", help="Parquet file of packuv manifest")
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/ and DIR/index.html"
+    )
+    command.add_argument(
+        "--names", type=_names, default=(), metavar="GLOB,GLOB", help="only sequences with one of these names (all)"
+    )
+    command.add_argument(
+        "--tags", type=_names, default=(), metavar="TAG,TAG", help="only sequences with all of these tags (all)"
+    )
+    command.add_argument(
+        "--at-once", type=_positive, default=None, metavar="N", help="sequences at a time (from cores and memory)"
+    )
+    command.add_argument("--jobs", type=_positive, default=1, metavar="N", help="segments of a sequence at once")
+    command.add_argument("--dry-run", action="store_true", help="only tell what would run, and why")
+    command.add_argument(
+        "--notify", default=None, metavar="CMD", help="shell command to run at the end if something failed"
+    )
+    _how(command, stop=True)
+
+
+def _how(command: argparse.ArgumentParser, *, stop: bool) -> None:
+    """Options of a run, be it of one sequence or of many."""
+    command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
+    command.add_argument("--quality", choices=QUALITIES, default="lossless", help="how near the file stays to the fit")
+    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what fits and renders")
+    command.add_argument(
+        "--frames", type=_range_text, default=":", metavar="A:B", help="instants A to B - 1, counted from 0 (all)"
+    )
     if stop:
         command.add_argument("--stop-after", choices=STAGES, default="report", metavar="STAGE", help=", ".join(STAGES))
-    command.add_argument("--jobs", type=_positive, default=None, metavar="N", help="segments at once (from the cores)")
     command.add_argument("--direct", action="store_true", help="run the same stages without the workflow engine")
     command.add_argument("--config", type=Path, default=None, metavar="FILE", help="TOML file with settings by stage")
     _seed(command)

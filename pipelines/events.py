@@ -113,9 +113,9 @@ class Journal:
             for audience in self._audience:
                 audience.told(label, text)
 
-    def started(self, label: str) -> None:
+    def started(self, label: str, forecast: Forecast | None = None) -> None:
         with self._lock:
-            self._active[label] = Forecast(self._clock())
+            self._active[label] = forecast or Forecast(self._clock())
             for audience in self._audience:
                 audience.began(label, self._active[label])
 

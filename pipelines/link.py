@@ -12,12 +12,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Protocol
 from uuid import UUID
 
 from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.settings import PREFECT_API_REQUEST_TIMEOUT, PREFECT_CLIENT_MAX_RETRIES, temporary_settings
-
-from tasks.artefacts.jobs import Jobs
 
 LISTEN_SECONDS = 2.0
 """Between two looks at the state of the run"""
@@ -30,6 +29,12 @@ FLUSH_SECONDS = 10.0
 REQUEST_SECONDS = 10.0
 
 Post = Callable[[SyncPrefectClient], object]
+
+
+class Cancellable(Protocol):
+    """What ends when its run is cancelled, as `Jobs` do."""
+
+    def cancel(self, reason: str) -> None: ...
 
 
 class Link:
@@ -47,7 +52,7 @@ class Link:
         self._thread: threading.Thread | None = None
         self._heard = time.monotonic()
 
-    def start(self, flow_run: UUID, jobs: Jobs) -> None:
+    def start(self, flow_run: UUID, jobs: Cancellable) -> None:
         """Listen to what happens to the flow run, whose jobs these are."""
         self._heard = time.monotonic()
         self._thread = threading.Thread(target=self._listen, args=(flow_run, jobs), name="link", daemon=True)
@@ -71,7 +76,7 @@ class Link:
         if self._thread:
             self._thread.join(FLUSH_SECONDS)
 
-    def _listen(self, flow_run: UUID, jobs: Jobs) -> None:
+    def _listen(self, flow_run: UUID, jobs: Cancellable) -> None:
         with (
             temporary_settings({PREFECT_CLIENT_MAX_RETRIES: 0, PREFECT_API_REQUEST_TIMEOUT: REQUEST_SECONDS}),
             get_client(sync_client=True) as client,
@@ -106,14 +111,14 @@ class Link:
     def _has_gone(self) -> bool:
         return self._died() or time.monotonic() - self._heard > PATIENCE_SECONDS
 
-    def _leave(self, server: str, jobs: Jobs) -> None:
+    def _leave(self, server: str, jobs: Cancellable) -> None:
         sentence = f"the workflow server at {server} has gone"
         jobs.cancel(sentence)
         self._finished.wait(ENDING_SECONDS)
         self._last_word(f"{sentence}; what is made is safe, and the same command goes on from here")
 
 
-def _hear(client: SyncPrefectClient, flow_run: UUID, jobs: Jobs) -> None:
+def _hear(client: SyncPrefectClient, flow_run: UUID, jobs: Cancellable) -> None:
     state = client.read_flow_run(flow_run).state
     if state is not None and (state.is_cancelling() or state.is_cancelled()):
         jobs.cancel("the run was cancelled")

@@ -111,10 +111,11 @@ class Engine:
     """Somebody may look at pictures while the run goes on"""
 
 
-def process_directly(request: RunRequest, journal: Journal) -> Outcome:
+def process_directly(request: RunRequest, journal: Journal, jobs: Jobs | None = None) -> Outcome:
     """Process a sequence in this process and its jobs, without the workflow engine."""
     with ThreadPoolExecutor(max_workers=jobs_at_once(request)) as pool:
-        return process(request, journal, Engine(lambda make: lambda stage: pool.submit(make, stage)), jobs_of(request))
+        engine = Engine(lambda make: lambda stage: pool.submit(make, stage))
+        return process(request, journal, engine, jobs or jobs_of(request))
 
 
 def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -> Outcome:
@@ -200,16 +201,18 @@ def plan_of(request: RunRequest, capture: Capture) -> Plan:
 
 def jobs_of(request: RunRequest) -> Jobs:
     """The jobs of a run, with the cores shared out evenly among those that run side by side."""
-    return Jobs(threads=max(1, _cores() // jobs_at_once(request)))
+    return Jobs(threads=max(1, cores_of(request) // jobs_at_once(request)))
 
 
 def jobs_at_once(request: RunRequest) -> int:
     """Stages that may run side by side."""
-    return request.jobs or max(1, _cores() // CORES_PER_JOB)
+    return request.jobs or max(1, cores_of(request) // CORES_PER_JOB)
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
+def cores_of(request: RunRequest | None = None) -> int:
+    """Cores that a run may keep busy; without one, those of this process."""
+    asked = request.cores if request else None
+    return asked or len(os.sched_getaffinity(0))
 
 
 def _leave_finished(sequence: Sequence, folder: Path) -> None:

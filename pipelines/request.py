@@ -20,6 +20,8 @@ QUALITIES = get_args(Fidelity)
 """How near the scene file stays to the fit, see `packuv.scene.encoder.TOLERANCES`"""
 STAGES = get_args(LastStage)
 """In the order in which a run does them"""
+BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+"""What is raised where the user has to change something, not we"""
 FORM: dict[str, Any] = {"use_attribute_docstrings": True, "extra": "forbid"}
 """How the workflow engine makes a form of a request, and what it does with JSON: see pydantic's configuration"""
 
@@ -54,6 +56,8 @@ class RunRequest:
     """Same seed, same bytes"""
     jobs: int | None = None
     """Segments at once; none: from the number of cores"""
+    cores: int | None = None
+    """To keep busy; none: all. The results do not depend on it where `jobs` is set"""
 
     def __post_init__(self) -> None:
         choices_of = {"preset": PRESETS, "quality": QUALITIES, "stop_after": STAGES, "device": get_args(Device)}
@@ -63,8 +67,9 @@ class RunRequest:
         for name in ("capture", "out"):
             if not Path(getattr(self, name)).is_absolute():
                 raise ValueError(f"{name} must be an absolute path, but is {getattr(self, name)!r}")
-        if self.jobs is not None and self.jobs < 1:
-            raise ValueError(f"jobs must be at least 1, but is {self.jobs}")
+        for name in ("jobs", "cores"):
+            if (count := getattr(self, name)) is not None and count < 1:
+                raise ValueError(f"{name} must be at least 1, but is {count}")
         parse_range(self.frames)
 
     @property

@@ -27,15 +27,17 @@ from pipelines.link import FLUSH_SECONDS, Link
 from pipelines.process import Engine, Outcome, find_sequence, jobs_at_once, jobs_of, process
 from pipelines.register import Place
 from pipelines.request import RunRequest
-from tasks.artefacts.jobs import CancelledError
+from tasks.artefacts.jobs import CancelledError, Jobs
 from tasks.artefacts.store import Store
 from tasks.engine import submitter
 
 SequenceFlow = Flow[[RunRequest], Outcome]
 
 
-def sequence_flow(journal: Callable[[], Journal], link: Callable[[], Link]) -> SequenceFlow:
-    """The flow; each of its runs has a journal and a link to the server of its own."""
+def sequence_flow(
+    journal: Callable[[], Journal], link: Callable[[], Link], jobs: Callable[[RunRequest], Jobs] = jobs_of
+) -> SequenceFlow:
+    """The flow; each of its runs has a journal, a link to the server and jobs of its own."""
 
     @flow(name="sequence", flow_run_name=_run_name, persist_result=False)
     def process_sequence(request: RunRequest) -> Any:
@@ -44,7 +46,7 @@ def sequence_flow(journal: Callable[[], Journal], link: Callable[[], Link]) -> S
         Args:
             request: Which capture, where to, and how.
         """
-        return _process(request, journal(), link())
+        return _process(request, journal(), link(), jobs(request))
 
     return process_sequence
 
@@ -76,8 +78,8 @@ def log_to_the_server_only() -> None:
     root.addHandler(logging.NullHandler())  # with none at all, Python would write warnings to the terminal
 
 
-def _process(request: RunRequest, journal: Journal, link: Link) -> Outcome | State[Any]:
-    context, jobs = FlowRunContext.get(), jobs_of(request)
+def _process(request: RunRequest, journal: Journal, link: Link, jobs: Jobs) -> Outcome | State[Any]:
+    context = FlowRunContext.get()
     assert context is not None
     assert context.flow_run is not None
     run_id = context.flow_run.id
@@ -89,7 +91,7 @@ def _process(request: RunRequest, journal: Journal, link: Link) -> Outcome | Sta
         dashboard = Dashboard(link, run_id, capture.name, store)
         place = Place(PREFECT_API_URL.value() or "", str(run_id))
         with journal.heard_by(dashboard), _runner(request) as runner:
-            engine = Engine(lambda make: submitter(make, runner), place, lambda old: _set_crashed(link, old), True)
+            engine = Engine(lambda make: submitter(make, runner), place, lambda old: set_crashed(link, old), True)
             outcome = process(request, journal, engine, jobs)
             dashboard.summarize(outcome)
             return outcome
@@ -113,7 +115,9 @@ def _run_name() -> str:
     return f"{Path(asked.capture).name} {asked.preset}"
 
 
-def _set_crashed(link: Link, place: Place) -> None:
+def set_crashed(link: Link, place: Place) -> None:
+    """Tell the engine of a run whose process was killed."""
+
     def post(client: Any) -> None:
         with suppress(ObjectNotFound):  # another server's
             client.set_flow_run_state(UUID(place.flow_run), Crashed(message="its process was killed"), force=True)

@@ -73,9 +73,13 @@ def cancel(arguments: argparse.Namespace) -> int:
         found = [run for run in found if run.record.sequence in arguments.sequence]
     if not found:
         raise ValueError(f"nothing runs in {arguments.folder}; packuv status tells what there is")
+    parts = {run.path for run in found if _batch_of(run, found)}
     for run in found:
-        _ask_to_end(run)
-    ended = [_wait_for(run) for run in found]
+        if run.path in parts and run.record.engine is None:
+            whole = f"which ends as a whole: packuv cancel {run.folder.parent}"
+            raise ValueError(f"{run.record.sequence} is part of a batch without the workflow engine, {whole}")
+    _ask_to_end(found)
+    ended = [_wait_for(run, kill=run.path not in parts) for run in found]
     for run, how in zip(found, ended, strict=True):
         print(f"{run.record.sequence}: {how or 'does not end; it runs on ' + run.record.host}")
     return 0 if all(ended) else 1
@@ -158,20 +162,27 @@ def _table(found: Sequence[Standing]) -> Table:
     return table
 
 
-def _ask_to_end(run: Found) -> None:
-    """The engine is told, so that its dashboard says Cancelled; the process is, in case there is no engine."""
-    record = run.record
-    told = record.engine is not None and _set_state(record.engine, "CANCELLING", "Cancelling")
-    if not told and record.host == socket.gethostname():
+def _batch_of(run: Found, asked: Sequence[Found]) -> bool:
+    """Whether its process has a batch to process that nobody asked to end."""
+    paths, who = [other.path for other in asked], (run.record.host, run.record.pid)
+    around = [other for other in find_runs(run.folder.parent) if other.alive and other.path not in paths]
+    return who in [(other.record.host, other.record.pid) for other in around]
+
+
+def _ask_to_end(runs: Sequence[Found]) -> None:
+    """The engine is told, so that its dashboard says Cancelled; the process is, once, in case there is no engine."""
+    records = [run.record for run in runs]
+    untold = [one for one in records if not (one.engine and _set_state(one.engine, "CANCELLING", "Cancelling"))]
+    for pid in {one.pid for one in untold if one.host == socket.gethostname()}:
         with contextlib.suppress(ProcessLookupError):
-            os.kill(record.pid, signal.SIGTERM)
+            os.kill(pid, signal.SIGTERM)
 
 
-def _wait_for(run: Found) -> str:
+def _wait_for(run: Found, *, kill: bool) -> str:
     """How the run ended; empty if it goes on."""
     if _ends_within(run, ENDING_SECONDS):
         return "cancelled"
-    if run.record.host == socket.gethostname():
+    if kill and run.record.host == socket.gethostname():
         with contextlib.suppress(ProcessLookupError):
             os.kill(run.record.pid, signal.SIGKILL)
         if _ends_within(run, ENDING_SECONDS):

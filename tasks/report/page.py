@@ -26,7 +26,7 @@ def page_text(report: ReportInput, limits: Limits = LIMITS) -> str:
     """The whole page as HTML."""
     found = findings(report, limits)
     return (
-        _templates()
+        templates()
         .get_template("page.html.j2")
         .render(
             name=report.name,
@@ -41,7 +41,8 @@ def page_text(report: ReportInput, limits: Limits = LIMITS) -> str:
 
 
 @cache
-def _templates() -> Environment:
+def templates() -> Environment:
+    """Of this room's pages."""
     environment = Environment(
         loader=PackageLoader("tasks.report"),
         autoescape=True,

@@ -1,0 +1,109 @@
+"""`packuv batch`: a data set from the command line, with or without the workflow engine."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+from rich.text import Text
+
+from pipelines.batch.request import BatchRequest
+from pipelines.commands.output import answer
+from pipelines.commands.progress import TerminalProgress
+from pipelines.commands.terminal import print_table
+from pipelines.events import Journal
+from pipelines.request import read_settings
+from pipelines.server import workflow_server
+
+if TYPE_CHECKING:
+    from pipelines.batch.plan import Step
+    from pipelines.batch.summary import Summary
+
+
+def command(arguments: argparse.Namespace) -> int:
+    """Exit code 0 if every sequence that was asked for is finished, else 1."""
+    request = request_from(arguments)
+    if arguments.dry_run:
+        return _tell(request, as_json=arguments.json)
+    progress = TerminalProgress(sys.stderr if arguments.json else sys.stdout)
+    with contextlib.closing(progress):
+        summary = run(request, Journal(progress), direct=arguments.direct)
+    if arguments.json:
+        answer(json.dumps(summary.to_json(), indent=1))
+    else:
+        print("\n".join(summary.lines()))
+    return 1 if summary.failed else 0
+
+
+def request_from(arguments: argparse.Namespace) -> BatchRequest:
+    """What the arguments of `packuv batch` ask for."""
+    return BatchRequest(
+        manifest=os.path.abspath(arguments.manifest),
+        out=os.path.abspath(arguments.out),
+        names=arguments.names,
+        tags=arguments.tags,
+        preset=arguments.preset,
+        quality=arguments.quality,
+        settings=read_settings(arguments.config, arguments.set),
+        frames=arguments.frames,
+        device=arguments.device,
+        seed=arguments.seed,
+        jobs=arguments.jobs,
+        at_once=arguments.at_once,
+        stop_after=arguments.stop_after,
+        notify=arguments.notify,
+    )
+
+
+def run(request: BatchRequest, journal: Journal, *, direct: bool) -> Summary:
+    """Process a data set; raises ValueError or FileNotFoundError for bad input before anything starts."""
+    from pipelines.batch.plan import plan_batch  # takes seconds, for which a misspelt option need not wait
+    from pipelines.batch.run import run_directly
+
+    if direct or not plan_batch(request).to_run:  # no engine for nothing
+        return run_directly(request, journal)
+    with workflow_server(Path(request.out)) as server:
+        journal.started("workflow engine")
+        from pipelines.batch.flow import run_flow
+        from pipelines.sequence import log_to_the_server_only
+
+        server.wait_ready()
+        journal.ended("workflow engine")
+        journal.told("dashboard", server.dashboard)
+        log_to_the_server_only()
+        return run_flow(request, journal, server.died)
+
+
+def _tell(request: BatchRequest, *, as_json: bool) -> int:
+    """What would run, and why."""
+    from pipelines.batch.plan import plan_batch
+
+    steps = plan_batch(request).steps
+    if as_json:
+        answer(json.dumps([{"sequence": step.name, "does": _does(step), "why": step.why} for step in steps], indent=1))
+        return 0
+    print_table(_table(steps))
+    print(f"{sum(step.runs for step in steps)} of {len(steps)} sequences would run")
+    return 0
+
+
+def _table(steps: Sequence[Step]) -> Table:
+    table = Table("sequence", "frames", "does", "why")
+    for step in steps:
+        style = "yellow" if step.problem else "" if step.runs else "dim"
+        cells = (step.name, str(step.frames), _does(step), step.why)
+        table.add_row(*(Text(cell) for cell in cells), style=style)
+    return table
+
+
+def _does(step: Step) -> str:
+    if step.problem is not None:
+        return "bad input"
+    return "runs" if step.runs else "there already"
