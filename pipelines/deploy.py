@@ -15,6 +15,7 @@ from prefect.client.schemas.schedules import CronSchedule
 from prefect.deployments.runner import RunnerDeployment
 from prefect.types.entrypoint import EntrypointType
 
+from pipelines.batch.flow import process_dataset
 from pipelines.sequence import process_sequence
 
 
@@ -59,4 +60,17 @@ def deployments(options: ServeOptions) -> list[RunnerDeployment]:
             tags=["packuv"],
         )
     ]
+    if options.data is not None:
+        made.append(
+            RunnerDeployment.from_flow(
+                process_dataset,
+                "nightly",
+                description=f"All captures of {options.data}: those that are new, changed or failed.",
+                parameters={"request": {"manifest": str(options.data), **common}},
+                schedules=[CronSchedule(cron=options.cron, timezone=options.timezone)] if options.cron else None,
+                entrypoint_type=EntrypointType.MODULE_PATH,
+                concurrency_limit=1,
+                tags=["packuv"],
+            )
+        )
     return made

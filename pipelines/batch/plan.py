@@ -14,6 +14,8 @@ import packuv
 from pipelines.batch.choice import choose, frames_of, problem_of, read_sequences
 from pipelines.batch.request import BatchRequest
 from pipelines.batch.table import Result, ResultTable, Rows, Status
+from pipelines.dataset import survey
+from pipelines.manifest import update
 from pipelines.options import compose
 from pipelines.register import find_runs
 from pipelines.request import RunRequest
@@ -99,8 +101,11 @@ def plan_batch(request: BatchRequest) -> Plan:
     Raises FileNotFoundError or ValueError without a manifest, for settings that do not exist, for filters that leave
     nothing, and where the same manifest is being processed into the same folder.
     """
-    out, manifest = Path(request.out), Path(request.manifest)
-    sequences = read_sequences(manifest)
+    out = Path(request.out)
+    if Path(request.manifest).is_dir():
+        out.mkdir(parents=True, exist_ok=True)
+        update(request.file, survey(Path(request.manifest)))
+    sequences = read_sequences(request.file)
     chosen = choose(sequences, request)
     asked = _asked(request)
     _check_alone(out, request)

@@ -17,7 +17,7 @@ class BatchRequest:
     __pydantic_config__: ClassVar[dict[str, Any]] = FORM
 
     manifest: str
-    """Parquet file that packuv manifest wrote, an absolute path"""
+    """Parquet file of packuv manifest, or a folder of captures, of which one is made first; an absolute path"""
     out: str
     """Output folder, an absolute path; results go to a folder in it for each sequence, and to index.html"""
     names: tuple[str, ...] = ()
@@ -69,9 +69,15 @@ class BatchRequest:
         )
 
     @property
+    def file(self) -> Path:
+        """The manifest, or where the one of a folder goes."""
+        given = Path(self.manifest)
+        return Path(self.out) / "manifest.parquet" if given.is_dir() else given
+
+    @property
     def table(self) -> Path:
         """Of results, beside the manifest."""
-        manifest = Path(self.manifest)
+        manifest = self.file
         return manifest.with_name(f"{manifest.stem}.results.parquet")
 
     @property
