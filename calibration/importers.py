@@ -26,6 +26,9 @@ from calibration.rig import Camera, Rig
 
 _PICTURE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".exr"}
 _VIDEO_SUFFIXES = {".mp4", ".mov", ".mkv", ".avi", ".webm", ".mxf"}
+_MOST_DEPTH = 64
+_DEEP_LINE = re.compile(rb"^(?:[ \t]*-[ \t]){64}|^[ \t]{256}", re.MULTILINE)
+"""More lists in one another than belong on a line, or as much white space as deep nesting needs"""
 _NAMES_SHOWN = 8
 _SHOWN = 1000
 """Characters of a message, which may repeat what a file says."""
@@ -462,6 +465,7 @@ def _read_easymocap(intri: Path, extri: Path) -> list[_View]:
 def _storage(path: Path) -> cv2.FileStorage:
     if not path.exists():
         raise FileNotFoundError(f"an EasyMocap calibration is intri.yml and extri.yml side by side, but no {path}")
+    _check_nesting(path)
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError):  # OpenCV's bindings wrap the parser's error in a SystemError that says nothing
@@ -469,6 +473,17 @@ def _storage(path: Path) -> cv2.FileStorage:
     if storage is None or not storage.isOpened():
         raise ValueError(f"{path.name} is no YAML file of OpenCV")
     return storage
+
+
+def _check_nesting(path: Path) -> None:
+    """OpenCV's parser goes as deep as a file does, until the stack ends and with it the program."""
+    content, depth = path.read_bytes(), 0
+    for mark in re.finditer(rb"[][{}]", content):
+        depth += 1 if mark[0] in b"[{" else -1
+        if depth > _MOST_DEPTH:
+            raise ValueError(f"{path.name} may be nested {_MOST_DEPTH} deep at most, but goes deeper")
+    if _DEEP_LINE.search(content):
+        raise ValueError(f"{path.name} may be nested {_MOST_DEPTH} deep at most, but goes deeper")
 
 
 def _easymocap_view(name: str, lenses: cv2.FileStorage, poses: cv2.FileStorage) -> _View:

@@ -434,3 +434,13 @@ def test_webcams_of_both_caliscope_layouts(data):
     assert all(
         np.allclose(a.camera_from_world, b.camera_from_world) for a, b in zip(new.cameras, old.cameras, strict=True)
     )
+
+
+@pytest.mark.parametrize(
+    "deep", ["names: " + "[" * 1000 + "]" * 1000, "- " * 1000 + "1", "names:\n" + " " * 1000 + "- a"]
+)
+def test_yaml_that_is_nested_too_deep_for_its_parser_is_refused(tmp_path, deep):
+    for name in ("intri.yml", "extri.yml"):
+        (tmp_path / name).write_text(f"%YAML:1.0\n---\n{deep}\n")
+    with pytest.raises(ValueError, match="may be nested 64 deep at most, but goes deeper"):
+        load_rig(tmp_path, ("cam1", "cam2"))
