@@ -104,7 +104,7 @@ def under_way(folder: Path) -> list[str]:
     return [stage.label for found in find_runs(folder) if found.alive for stage in found.record.stages]
 
 
-def wait_for(what: Callable[[], object], seconds: float = 240) -> None:
+def wait_for(what: Callable[[], object], seconds: float = 540) -> None:
     deadline = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < deadline, "it takes too long"
