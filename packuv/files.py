@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from packuv.bounds import MOST_JSON_BYTES, MOST_JSON_VALUES, check_depth
+from packuv.partial import partial_path
 
 
 def parse_json(content: bytes, what: str) -> Any:
@@ -63,7 +64,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"no folder {path.parent} to write {path.name} in; make it first")
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    partial = partial_path(path, path.suffix)
     try:
         yield partial
         with partial.open("rb+") as file:
@@ -84,7 +85,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
         raise FileNotFoundError(f"no folder {path.parent} to write {path.name} in; make it first")
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         raise FileExistsError(f"{path} must be new or an empty folder; choose another, or remove it")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = partial_path(path)
     try:
         partial.mkdir()
         yield partial

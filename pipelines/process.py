@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from packuv.fit.device import choose_device
+from packuv.partial import partial_path
 from pipelines.chain import Submit
 from pipelines.events import Event, Journal
 from pipelines.folder import claim
@@ -238,8 +239,8 @@ def _publish(run: Run, folder: Path) -> Outcome:
 
 def place(source: Path, target: Path) -> None:
     """Give an artefact's file a second name, or a copy where the file system has no links; never half a file."""
-    part = target.with_name(f".{target.name}.part")
-    part.unlink(missing_ok=True)
+    part = partial_path(target)
+    part.unlink(missing_ok=True)  # of a killed run
     try:
         os.link(source, part)
     except OSError:

@@ -26,6 +26,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import BinaryIO
 
+from packuv.partial import partial_path
 from tasks.artefacts.jobs import die_with_parent
 from tasks.artefacts.recipe import write_json
 from tasks.artefacts.store import try_lock
@@ -313,7 +314,7 @@ def _keep_empty(database: Path) -> None:
     with contextlib.suppress(OSError, sqlite3.Error):
         template = _template()
         template.parent.mkdir(parents=True, exist_ok=True)
-        part = template.with_name(f".{template.name}.{os.getpid()}.part")
+        part = partial_path(template)
         part.unlink(missing_ok=True)
         with contextlib.closing(sqlite3.connect(database)) as source, contextlib.closing(sqlite3.connect(part)) as copy:
             source.backup(copy)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from signal import SIG_IGN, SIGHUP, SIGINT, getsignal, signal
 
 import pytest
 
@@ -11,7 +12,13 @@ from tests.support.places import DATA
 
 
 def pytest_configure() -> None:
-    """A misspelt promise must not pass for none."""
+    """A misspelt promise must not pass for none; what tests start must hear signals, also in a session that does not.
+
+    A session in the background or under nohup ignores them, and hands that on; handlers are not handed on.
+    """
+    for number in (SIGHUP, SIGINT):
+        if getsignal(number) is SIG_IGN:
+            signal(number, lambda *_: None)
     try:
         promised()
     except ValueError as error:

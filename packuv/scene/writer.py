@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from packuv.gaussians.segment import Segment
+from packuv.partial import partial_path
 from packuv.progress import Progress, no_progress, part_of
 from packuv.scene.encoder import EncodeOptions, SceneEncoder, survey
 from packuv.scene.header import SceneHeader
@@ -45,7 +46,7 @@ def write_scene(
     """
     path, options = Path(path), options or EncodeOptions()
     found = survey(segments, header, options)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = partial_path(path)
     steps = 2 * len(header.times_ns)
     try:
         with tempfile.TemporaryFile(dir=path.parent) as file:

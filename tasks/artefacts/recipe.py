@@ -18,6 +18,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from packuv.partial import partial_path
 from tasks.artefacts import recipe
 
 T = TypeVar("T")
@@ -238,7 +239,7 @@ def _described(kind: Any) -> str:
 
 def write_json(path: Path, value: Any) -> None:
     """Replace a JSON file in one step; a reader sees the old text or the new one."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = partial_path(path)
     try:
         with naming(path):
             part.write_text(json.dumps(recipe.plain(value), indent=1))

@@ -12,8 +12,10 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import pytest
 
@@ -73,11 +75,13 @@ def served(tmp_path_factory) -> Iterator[tuple[Api, Path]]:
     out = tmp_path_factory.mktemp("served")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "pipelines.cli", "serve", "--out", str(out), "--port", str(port), "--preset"]
+    command = [sys.executable, "-m", "pipelines.cli", "serve", "--out", str(out), "--port", str(port)]
+    command += ["--preset", "draft", "--data", str(CAPTURE.parent), "--cron", "0 2 * * *"]
+    command += ["--timezone", "Europe/Berlin"]
     log = out / "serve.log"
     with (
         open(log, "w") as output,
-        subprocess.Popen([*command, "draft"], env=environment(), stdout=output, stderr=output) as process,
+        subprocess.Popen(command, env=environment(), stdout=output, stderr=output) as process,
     ):
         api = Api(f"http://127.0.0.1:{port}/api")
 
@@ -157,6 +161,17 @@ def test_cancel_on_the_dashboard_ends_the_work_within_seconds(served):
 
 
 @pytest.mark.slow
+def test_a_schedule_plans_runs_for_its_time(served):
+    api, _ = served
+    nightly = api.deployment("nightly")["id"]
+    asked = {"flow_runs": {"deployment_id": {"any_": [nightly]}}}
+    runs = wait_for(lambda: api("/flow_runs/filter", asked), seconds=90)
+    assert {run["state"]["type"] for run in runs} == {"SCHEDULED"}
+    times = [datetime.fromisoformat(run["expected_start_time"]).astimezone(ZoneInfo("Europe/Berlin")) for run in runs]
+    assert {(time.hour, time.minute) for time in times} == {(2, 0)}
+
+
+@pytest.mark.slow
 def test_a_worker_runs_what_prefect_yaml_deploys(served, tmp_path):
     api, out = served
     settings = environment(PREFECT_API_URL=api.url, PREFECT_HOME=str(tmp_path), DO_NOT_TRACK="1")
@@ -177,7 +192,7 @@ def test_a_worker_runs_what_prefect_yaml_deploys(served, tmp_path):
             run = api.start("from-yaml", capture=str(CAPTURE), out=str(out), name="worked", stop_after="sync")
             wait_for(api.ended(run))
         finally:
-            worker.terminate()
+            worker.kill()  # asked gently, it may take minutes
     assert api.run(run)["state"]["type"] == "COMPLETED"
     assert (out / "worked" / "report.html").is_file()
 

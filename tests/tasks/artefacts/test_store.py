@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from fractions import Fraction
@@ -395,3 +396,11 @@ def test_damaged_memory_is_no_harm(tmp_path):
     assert digests({"cam00": file}) == {"cam00": file_digest(file)}
     with pytest.raises(FileNotFoundError, match=r"no file .*cam01\.mp4"):
         digests({"cam01": tmp_path / "cam01.mp4"})
+
+
+def test_threads_that_write_one_file_leave_it_whole(tmp_path):
+    path = tmp_path / "file_digests.json"
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda number: write_json(path, {"number": number}), range(400)))
+    assert json.loads(path.read_text())["number"] in range(400)
+    assert list(tmp_path.iterdir()) == [path]
