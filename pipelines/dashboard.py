@@ -51,18 +51,58 @@ CHART_STYLE = (
 Row = dict[str, Any]
 
 
+class Board:
+    """The artefacts of a flow run on the dashboard, named after a sequence or data set."""
+
+    def __init__(self, link: Link, flow_run: UUID, name: str) -> None:
+        self._link, self._flow_run, self._name = link, flow_run, name
+        self._known: dict[str, UUID] = {}
+
+    def put(
+        self, name: str, kind: str, data: Any, description: str, *, task_run: UUID | None = None, changing: str = ""
+    ) -> None:
+        """Show something soon; with `changing`, in place of what was put under that word before."""
+
+        def post(client: SyncPrefectClient) -> None:
+            if changing in self._known:
+                client.update_artifact(self._known[changing], ArtifactUpdate(data=data, description=description))
+                return
+            artefact = ArtifactCreate(
+                key=slug(f"{self._name}-{name}"),
+                type=kind,
+                data=data,
+                description=description,
+                flow_run_id=self._flow_run,
+                task_run_id=task_run,
+            )
+            made = client.create_artifact(artefact).id
+            if changing:
+                self._known[changing] = made
+
+        self._link.post(post, instead_of=changing or None)
+
+    def progress(self, share: float, text: str, *, of: str, task_run: UUID | None = None) -> None:
+        """A bar, one for each word in `of`."""
+        percent = round(100 * min(1.0, share), 1)
+        self.put("progress", "progress", percent, text, task_run=task_run, changing=f"progress of {of}")
+
+    def summary(self, what: str, page: Path, text: str, description: str) -> None:
+        """How it ended, with a link to the page about it."""
+        lines = [f"# {self._name}", f"[Open the {what}]({results_url(page)}) ({page})", "```", text, "```"]
+        self.put("summary", "markdown", "\n\n".join(lines), description)
+
+
 class Dashboard:
     """A `pipelines.events.Audience`; called in the threads of the tasks, whose runs it knows by their context."""
 
     def __init__(self, link: Link, flow_run: UUID, sequence: str, store: Store) -> None:
-        self._link = link
-        self._flow_run = flow_run
-        self._sequence = sequence
+        self._board = Board(link, flow_run, sequence)
         self._store = store
         self._log = get_run_logger()
         self._posted: dict[str, float] = {}
         self._logged: dict[str, float] = {}
-        self._bars: dict[str, UUID] = {}
+        self._barred: set[str] = set()
+        """Stages whose progress is shown"""
         self._previews: list[Row] = []
 
     def began(self, label: str, forecast: Forecast) -> None:
@@ -80,7 +120,7 @@ class Dashboard:
     def ended(self, event: Event) -> None:
         level = logging.ERROR if event.outcome == "failed" and not event.stopped else logging.INFO
         self._logger().log(level, "%s: %s", event.label, outcome(event))
-        if event.label in self._bars and event.outcome == "made":
+        if event.label in self._barred and event.outcome == "made":
             self._bar(event.label, 1.0, f"done in {duration(event.seconds)}")
         if event.key is not None and event.key.stage in SHOWN and self._store.holds(event.key):  # not a lender's
             SHOWN[event.key.stage](self, self._store.path(event.key))
@@ -90,15 +130,7 @@ class Dashboard:
 
     def summarize(self, results: Outcome) -> None:
         """Where the results are, and how good."""
-        address = results_url(results.report)
-        lines = [
-            f"# {self._sequence}",
-            f"[Open the report]({address}) ({results.report})",
-            "```",
-            results.farewell(),
-            "```",
-        ]
-        self._artifact("summary", "markdown", "\n\n".join(lines), "What came out of the run")
+        self._board.summary("report", results.report, results.farewell(), "What came out of the run")
         self._log.info("%s", results.farewell())
 
     def sync(self, folder: Path) -> None:
@@ -153,40 +185,14 @@ class Dashboard:
         self._image("preview", url, f"Frame {last} of {next(iter(levels))}: filmed at the left, rendered at the right")
 
     def _bar(self, label: str, share: float, text: str) -> None:
-        data, description = round(100 * min(1.0, share), 1), f"{label}: {text}"
-        run = self._task_run()
-
-        def post(client: SyncPrefectClient) -> None:
-            if label in self._bars:
-                client.update_artifact(self._bars[label], ArtifactUpdate(data=data, description=description))
-            else:
-                made = self._create(client, "progress", "progress", data, description, run)
-                self._bars[label] = made
-
-        self._link.post(post, instead_of=label)
+        self._barred.add(label)
+        self._board.progress(share, f"{label}: {text}", of=label, task_run=_task_run())
 
     def _table(self, name: str, rows: Iterable[Row], description: str) -> None:
-        self._artifact(name, "table", json.dumps(list(rows)), description)
+        self._board.put(name, "table", json.dumps(list(rows)), description, task_run=_task_run())
 
     def _image(self, name: str, url: str, description: str) -> None:
-        self._artifact(name, "image", url, description)
-
-    def _artifact(self, name: str, kind: str, data: Any, description: str) -> None:
-        run = self._task_run()
-        self._link.post(lambda client: self._create(client, name, kind, data, description, run))
-
-    def _create(
-        self, client: SyncPrefectClient, name: str, kind: str, data: Any, description: str, task_run: UUID | None
-    ) -> UUID:
-        key = slug(f"{self._sequence}-{name}")
-        artifact = ArtifactCreate(
-            key=key, type=kind, data=data, description=description, flow_run_id=self._flow_run, task_run_id=task_run
-        )
-        return client.create_artifact(artifact).id
-
-    def _task_run(self) -> UUID | None:
-        context = TaskRunContext.get()
-        return context.task_run.id if context else None
+        self._board.put(name, "image", url, description, task_run=_task_run())
 
     def _logger(self) -> Any:
         """That of the task where there is one, so that the dashboard shows the line there."""
@@ -209,6 +215,12 @@ def run_tags(run: FlowRun | None, request: RunRequest, capture: Capture) -> list
     """By which runs are found: those that the run has, the sequence, the preset, and the capture's own."""
     own = [f"seq:{capture.name}", f"preset:{request.preset}", *capture.settings.tags]
     return list(dict.fromkeys([*(run.tags if run else ()), "packuv", *own]))
+
+
+def _task_run() -> UUID | None:
+    """Of the thread's task, where it has one."""
+    context = TaskRunContext.get()
+    return context.task_run.id if context else None
 
 
 def slug(text: str) -> str:
