@@ -224,7 +224,8 @@ def _items(store: Store) -> Iterator[Item]:
 
 
 def _homes(folder: Path) -> list[Path]:
-    return sorted(lock.parent for lock in (folder / ENGINE).glob(f"*/{ENGINE_LOCK}"))
+    """Of servers that runs brought along, which are numbered; that of `packuv serve` keeps the history of runs."""
+    return sorted(lock.parent for lock in (folder / ENGINE).glob(f"[0-9]*/{ENGINE_LOCK}"))
 
 
 @contextlib.contextmanager
