@@ -19,6 +19,7 @@ from prefect.settings import PREFECT_API_URL
 from prefect.states import Cancelled, Completed, Failed
 
 from pipelines.batch.dashboard import BatchDashboard
+from pipelines.batch.plan import with_manifest
 from pipelines.batch.request import BatchRequest
 from pipelines.batch.run import Batch, BatchEngine
 from pipelines.batch.summary import Summary
@@ -80,6 +81,7 @@ def _process(request: BatchRequest, journal: Journal, link: Link, died: Callable
     assert context is not None
     assert context.flow_run is not None
     run = context.flow_run
+    request = with_manifest(request)
     batch = Batch(request, journal)
     link.start(run.id, batch)
     try:

@@ -95,6 +95,17 @@ class Plan:
         return tuple(step for step in self.steps if step.runs)
 
 
+def with_manifest(request: BatchRequest) -> BatchRequest:
+    """The request, with a manifest in place of a folder: `out`/<folder>.parquet, brought up to date."""
+    folder = Path(request.manifest)
+    if not folder.is_dir():
+        return request
+    path = Path(request.out) / f"{folder.name}.parquet"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    update(path, survey(folder))
+    return replace(request, manifest=str(path))
+
+
 def plan_batch(request: BatchRequest) -> Plan:
     """What the request means now.
 
@@ -102,10 +113,7 @@ def plan_batch(request: BatchRequest) -> Plan:
     nothing, and where the same manifest is being processed into the same folder.
     """
     out = Path(request.out)
-    if Path(request.manifest).is_dir():
-        out.mkdir(parents=True, exist_ok=True)
-        update(request.file, survey(Path(request.manifest)))
-    sequences = read_sequences(request.file)
+    sequences = read_sequences(Path(request.manifest))
     chosen = choose(sequences, request)
     asked = _asked(request)
     _check_alone(out, request)

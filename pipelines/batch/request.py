@@ -69,15 +69,9 @@ class BatchRequest:
         )
 
     @property
-    def file(self) -> Path:
-        """The manifest, or where the one of a folder goes."""
-        given = Path(self.manifest)
-        return Path(self.out) / "manifest.parquet" if given.is_dir() else given
-
-    @property
     def table(self) -> Path:
         """Of results, beside the manifest."""
-        manifest = self.file
+        manifest = Path(self.manifest)
         return manifest.with_name(f"{manifest.stem}.results.parquet")
 
     @property

@@ -17,9 +17,9 @@ from rich.text import Text
 from pipelines.batch.request import BatchRequest
 from pipelines.commands.output import answer
 from pipelines.commands.progress import TerminalProgress
+from pipelines.commands.run import asked_for
 from pipelines.commands.terminal import print_table
 from pipelines.events import Journal
-from pipelines.request import read_settings
 from pipelines.server import workflow_server
 
 if TYPE_CHECKING:
@@ -49,24 +49,20 @@ def request_from(arguments: argparse.Namespace) -> BatchRequest:
         out=os.path.abspath(arguments.out),
         names=arguments.names,
         tags=arguments.tags,
-        preset=arguments.preset,
-        quality=arguments.quality,
-        settings=read_settings(arguments.config, arguments.set),
-        frames=arguments.frames,
-        device=arguments.device,
-        seed=arguments.seed,
         jobs=arguments.jobs,
         at_once=arguments.at_once,
         stop_after=arguments.stop_after,
         notify=arguments.notify,
+        **asked_for(arguments),
     )
 
 
 def run(request: BatchRequest, journal: Journal, *, direct: bool) -> Summary:
     """Process a data set; raises ValueError or FileNotFoundError for bad input before anything starts."""
-    from pipelines.batch.plan import plan_batch  # takes seconds, for which a misspelt option need not wait
+    from pipelines.batch.plan import plan_batch, with_manifest  # takes seconds, which a misspelt option need not wait
     from pipelines.batch.run import run_directly
 
+    request = with_manifest(request)
     if direct or not plan_batch(request).to_run:  # no engine for nothing
         return run_directly(request, journal)
     with workflow_server(Path(request.out)) as server:
@@ -83,9 +79,9 @@ def run(request: BatchRequest, journal: Journal, *, direct: bool) -> Summary:
 
 def _tell(request: BatchRequest, *, as_json: bool) -> int:
     """What would run, and why."""
-    from pipelines.batch.plan import plan_batch
+    from pipelines.batch.plan import plan_batch, with_manifest
 
-    steps = plan_batch(request).steps
+    steps = plan_batch(with_manifest(request)).steps
     if as_json:
         answer(json.dumps([{"sequence": step.name, "does": _does(step), "why": step.why} for step in steps], indent=1))
         return 0

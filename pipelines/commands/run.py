@@ -8,7 +8,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipelines.commands.output import answer
 from pipelines.commands.progress import TerminalProgress
@@ -42,16 +42,17 @@ def request_from(arguments: argparse.Namespace) -> RunRequest:
         capture=os.path.abspath(arguments.capture),
         out=os.path.abspath(arguments.out),
         name=arguments.name,
-        preset=arguments.preset,
-        quality=arguments.quality,
-        settings=read_settings(arguments.config, arguments.set),
-        frames=arguments.frames,
         hold_out=arguments.hold_out,
         stop_after=arguments.stop_after if arguments.command == "run" else arguments.command,
-        device=arguments.device,
-        seed=arguments.seed,
         jobs=arguments.jobs,
+        **asked_for(arguments),
     )
+
+
+def asked_for(arguments: argparse.Namespace) -> dict[str, Any]:
+    """How to process, be it one sequence or many: fields that both requests have."""
+    named = {name: getattr(arguments, name) for name in ("preset", "quality", "frames", "device", "seed")}
+    return {**named, "settings": read_settings(arguments.config, arguments.set)}
 
 
 def run(request: RunRequest, journal: Journal, *, direct: bool) -> Outcome:

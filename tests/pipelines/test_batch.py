@@ -114,7 +114,7 @@ def test_sequences_are_chosen_by_name_and_tag(manifest, tmp_path, capsys):
 
 def test_a_folder_serves_as_a_manifest(dataset, tmp_path, capsys):
     assert set(plan(dataset, tmp_path / "out", capsys)) == {"day1-dance", "day2-dance", "cut"}
-    assert (tmp_path / "out" / "manifest.parquet").is_file()
+    assert (tmp_path / "out" / "shoot.parquet").is_file()
 
 
 def test_what_is_no_manifest_is_refused(tmp_path, capsys):
