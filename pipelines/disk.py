@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
-from stat import S_ISREG
+
+from tasks.artefacts.retention import files_in
 
 BLOCK_BYTES = 512
 """Unit of st_blocks, whatever the file system's own"""
@@ -18,7 +18,7 @@ def free_bytes(path: Path) -> int:
 
 def used_bytes(folder: Path) -> int:
     """What the files in a folder take of their disk; a file that is not written yet takes nothing."""
-    return sum(status.st_blocks * BLOCK_BYTES for status in map(os.lstat, folder.rglob("*")) if S_ISREG(status.st_mode))
+    return sum(status.st_blocks * BLOCK_BYTES for status in files_in(folder))
 
 
 def _existing(path: Path) -> Path:

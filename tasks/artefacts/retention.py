@@ -244,7 +244,8 @@ def _empty(home: Path) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def _files(folder: Path) -> Iterator[os.stat_result]:
+def files_in(folder: Path) -> Iterator[os.stat_result]:
+    """What the system says of every file in a folder that is still there, at any depth."""
     for inside, _, names in os.walk(folder):  # which does not mind that a run elsewhere in the folder removes some
         for name in names:
             with contextlib.suppress(FileNotFoundError):
@@ -252,13 +253,13 @@ def _files(folder: Path) -> Iterator[os.stat_result]:
 
 
 def _own_bytes(folder: Path) -> int:
-    return sum(stat.st_size for stat in _files(folder) if stat.st_nlink == 1)
+    return sum(stat.st_size for stat in files_in(folder) if stat.st_nlink == 1)
 
 
 def _bytes_in(folder: Path) -> int:
     """Of all files, each counted once whatever its names."""
-    return sum({(stat.st_dev, stat.st_ino): stat.st_size for stat in _files(folder)}.values())
+    return sum({(stat.st_dev, stat.st_ino): stat.st_size for stat in files_in(folder)}.values())
 
 
 def _newest(folder: Path) -> float:
-    return max([folder.stat().st_mtime, *(stat.st_mtime for stat in _files(folder))])
+    return max([folder.stat().st_mtime, *(stat.st_mtime for stat in files_in(folder))])
