@@ -45,6 +45,10 @@ WRONG_PATH = frozenset({errno.ENAMETOOLONG, errno.ELOOP})
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
+MOST_SAID = 2000
+"""Characters of a message"""
+
+
 class UsageError(ValueError):
     """The command line cannot be understood."""
 
@@ -132,8 +136,10 @@ def _load(name: str) -> Callable[[argparse.Namespace], int]:
 
 
 def _say(code: int, problem: object) -> int:
-    """One line on stderr."""
-    print(f"packuv: {' '.join(str(problem).split())}", file=sys.stderr)
+    """One line on stderr, in which names from files do nothing to the terminal, and do not fill it."""
+    line = " ".join(str(problem).split())
+    line = line if len(line) <= MOST_SAID else f"{line[:MOST_SAID]} ..."
+    print(f"packuv: {''.join(c if c.isprintable() else ascii(c)[1:-1] for c in line)}", file=sys.stderr)
     return code
 
 

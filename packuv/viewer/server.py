@@ -37,6 +37,11 @@ NUMBERED = re.compile(r"/(segments|frames)/(0|[1-9][0-9]{0,8})\.bin")
 POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """Content security policy: a page that tries to reach another origin fails at once"""
 
+PATIENCE_SECONDS = 30
+"""How long a connection may say nothing"""
+MOST_CONNECTIONS = 64
+"""At a time; a browser opens six"""
+
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
@@ -53,6 +58,8 @@ def serve(
     Port 0 takes any free port. `announce` gets the address once it answers; by default it is printed. Raises
     FileNotFoundError for a missing file, ValueError for one that is no scene, OSError where the port is taken.
     """
+    if not 0 <= port < 2**16:
+        raise ValueError(f"a port is a number from 0 to {2**16 - 1}, but is {port}")
     with open_source(scene_path) as source, ViewerServer((host, port), source) as server:
         announce(server.url) if announce else print(server.url, flush=True)
         if open_browser:
@@ -65,12 +72,27 @@ class ViewerServer(ThreadingHTTPServer):
     """Serves one source; the address is bound once constructed, `serve_forever` answers."""
 
     daemon_threads = True
+    request_queue_size = MOST_CONNECTIONS
 
     def __init__(self, address: tuple[str, int], source: Source) -> None:
         super().__init__(address, _Handler)
         self.source = source
         self.reading = threading.Lock()  # decoders keep state
+        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.tables = lru_cache(maxsize=1)(lambda: tables_bytes(source.quantizer))
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Hang up on a caller too many."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A page that seeks or closes drops its requests; that is no news."""
@@ -109,6 +131,7 @@ class ViewerServer(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     server: ViewerServer
+    timeout = PATIENCE_SECONDS
     protocol_version = "HTTP/1.1"
     server_version = "packuv"
 
@@ -128,7 +151,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             found = self.server.content(path)
         except Exception as error:  # a damaged file must reach the page as words, not as a dropped connection
-            message = f"{path}: {error}\n".encode()
+            message = f"{path}: {error}\n".encode(errors="replace")
             return self._send(HTTPStatus.INTERNAL_SERVER_ERROR, message, "text/plain; charset=utf-8", with_body)
         if found is None:
             return self._send(HTTPStatus.NOT_FOUND, b"nothing here\n", "text/plain; charset=utf-8", with_body)

@@ -179,3 +179,12 @@ def test_help_is_fast():
     assert "usage: packuv" in done.stdout
     # 0.2 s on a quiet machine; a heavy import would take seconds, a busy machine takes a few times more
     assert time.monotonic() - start < 3
+
+
+def test_what_a_file_is_called_does_nothing_to_the_terminal(tmp_path, capsys):
+    assert main(["info", str(tmp_path / "\x1b[2J\x07scene.mkv")]) == WRONG
+    said = capsys.readouterr().err
+    assert "\\x1b[2J\\x07scene.mkv" in said
+    assert said[:-1].isprintable()
+    assert main(["info", "a" * 10_000]) == WRONG
+    assert len(capsys.readouterr().err) < 2_100

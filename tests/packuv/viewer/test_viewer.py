@@ -7,6 +7,7 @@ import http.client
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -20,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
@@ -30,7 +31,7 @@ from packuv.raster import RasterOptions, render
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.viewer import serve
 from packuv.viewer import server as viewer_server
-from packuv.viewer.server import PAGES, ViewerServer
+from packuv.viewer.server import MOST_CONNECTIONS, PAGES, ViewerServer
 from packuv.viewer.source import (
     SegmentSource,
     Source,
@@ -321,6 +322,53 @@ def test_damage_reaches_the_page_as_words() -> None:
     with running(Damaged(make_source().parts, make_quantizer())) as server:
         answer, body = fetch(server, "/frames/1.bin")
     assert (answer.status, body) == (500, b"/frames/1.bin: packet 3 is damaged\n")
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    asked=st.binary(max_size=300)
+    | st.sampled_from([b"GET ", b"HEAD ", b"POST ", b"get "]).flatmap(
+        lambda start: st.binary(max_size=80).map(lambda rest: start + b"/frames/1.bin HTTP/1.1\r\nHost:" + rest)
+    )
+)
+def test_whatever_is_sent_the_server_goes_on(
+    asked: bytes, capfd: pytest.CaptureFixture[str], asked_server: ViewerServer
+) -> None:
+    with socket.create_connection(asked_server.server_address[:2], timeout=5) as caller:
+        caller.sendall(asked + b"\r\n\r\n")
+        caller.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(ConnectionError):
+            while caller.recv(1 << 16):
+                pass
+    assert fetch(asked_server, "/frames/1.bin")[0].status == 200
+    assert capfd.readouterr().err == ""  # no traceback on the terminal
+
+
+@pytest.fixture(scope="module")
+def asked_server() -> Iterator[ViewerServer]:
+    with running(make_source()) as server:
+        yield server
+
+
+def test_callers_too_many_are_hung_up_on_and_others_are_served_again() -> None:
+    with running(make_source()) as server, contextlib.ExitStack() as silent:
+        for _ in range(MOST_CONNECTIONS):
+            silent.enter_context(socket.create_connection(server.server_address[:2], timeout=5))
+        one_more = silent.enter_context(socket.create_connection(server.server_address[:2], timeout=5))
+        assert one_more.recv(1) == b""
+        silent.close()
+        wait_until = time.monotonic() + 5
+        while True:
+            with contextlib.suppress(ConnectionError):
+                assert fetch(server, "/frames/1.bin")[0].status == 200
+                break
+            assert time.monotonic() < wait_until
+
+
+def test_a_caller_who_says_nothing_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("packuv.viewer.server._Handler.timeout", 0.2)
+    with running(make_source()) as server, socket.create_connection(server.server_address[:2], timeout=5) as caller:
+        assert caller.recv(1) == b""
 
 
 # ---- page
