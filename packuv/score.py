@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, cast, get_origin, get_type_hints
+from typing import Annotated, Any, cast
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from packuv.metrics import psnr, ssim
 from packuv.progress import Progress
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene
+from packuv.tables import column_types
 
 
 @dataclass(frozen=True)
@@ -45,15 +46,7 @@ class Score:
     colour: what blinks in the render but not in the truth, whatever moves. None in a first frame"""
 
 
-COLUMN_TYPES = {int: pa.int64(), str: pa.string(), bool: pa.bool_(), float: pa.float64(), float | None: pa.float64()}
-"""What the table holds a field as whose annotation names no other Arrow type"""
-
-
-def _column_type(annotation: Any) -> pa.DataType:
-    return annotation.__metadata__[0] if get_origin(annotation) is Annotated else COLUMN_TYPES[annotation]
-
-
-SCHEMA = pa.schema([(name, _column_type(kind)) for name, kind in get_type_hints(Score, include_extras=True).items()])
+SCHEMA = pa.schema(list(column_types(Score).items()))
 FIGURES = tuple(column.name for column in SCHEMA if column.type == pa.float64())
 """Fields of which means say something"""
 

@@ -15,14 +15,14 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from types import UnionType
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from packuv.files import whole_file
 from packuv.progress import Progress, no_progress
+from packuv.tables import column_types, optional_fields
 from pipelines.dataset import READERS, Found, Survey, sentence
 from sync.capture import Capture, file_timecodes
 from sync.probe import VideoInfo, probe_video
@@ -76,16 +76,8 @@ class Row:
     """What the timecode file was when its lines last fitted the video"""
 
 
-COLUMN_TYPES = {int: pa.int64(), str: pa.string(), bool: pa.bool_(), float: pa.float64()}
-
-
-def _column(name: str, annotation: Any) -> pa.Field:
-    kind = get_args(annotation)[0] if isinstance(annotation, UnionType) else annotation
-    column = COLUMN_TYPES.get(kind, pa.list_(pa.string()))
-    return pa.field(name, column, nullable=isinstance(annotation, UnionType))
-
-
-SCHEMA = pa.schema([_column(name, kind) for name, kind in get_type_hints(Row).items()])
+OPTIONAL = optional_fields(Row)
+SCHEMA = pa.schema([pa.field(name, kind, nullable=name in OPTIONAL) for name, kind in column_types(Row).items()])
 VIDEO_COLUMNS = (
     *("codec", "width", "height", "frames", "fps", "duration_s", "start_label"),
     *("bytes", "mtime_ns", "digest", "inode", "ctime_ns"),

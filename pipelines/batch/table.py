@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from packuv.files import whole_file
+from packuv.tables import column_types
 
 KIND, VERSION = b"packuv_results", b"1"
 NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENOTDIR, errno.ENOENT)
@@ -73,11 +74,7 @@ class Result:
     """Of request, program, capture and result, see `pipelines.batch.plan.Fingerprint`"""
 
 
-TYPES = {"bool": pa.bool_(), "float": pa.float64(), "int": pa.int64()}
-SCHEMA = pa.schema(
-    [pa.field(field.name, TYPES.get(str(field.type).removesuffix(" | None"), pa.string())) for field in fields(Result)],
-    metadata={KIND: VERSION},
-)
+SCHEMA = pa.schema(list(column_types(Result).items()), metadata={KIND: VERSION})
 Rows = dict[tuple[str, str], Result]
 """By sequence and output folder"""
 
