@@ -29,7 +29,7 @@ from pipelines.commands.output import check_written, lasting_output
 from pipelines.disk import free_bytes, size_text
 from pipelines.ending import Terminated, ending_gently
 from pipelines.request import BAD_INPUT, PRESETS, QUALITIES, STAGES, parse_range
-from tasks.artefacts.jobs import CancelledError
+from tasks.artefacts.jobs import ONE_BLAS_THREAD, CancelledError
 
 OK, FAILED, WRONG, INTERRUPTED = 0, 1, 2, 130
 SINGLE = {
@@ -95,6 +95,7 @@ class _Version(argparse.Action):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the `packuv` command with these arguments, by default those of the process; returns the exit code."""
+    os.environ |= ONE_BLAS_THREAD  # before NumPy is loaded, and for all that a command starts
     with lasting_output(), ending_gently():
         return _outcome(sys.argv[1:] if argv is None else argv)
 

@@ -34,10 +34,12 @@ Job = Callable[[Progress], Any]
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
     "NUMBA_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
 )
+ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+"""NumPy's BLAS waits for ever for its own threads where cores are busy (13 of 36 processes that only solved small least
+squares, three at a time on two cores); nothing here needs them"""
 RAISED_AS = (FileNotFoundError, NotADirectoryError, PermissionError, OSError, ValueError, MemoryError)
 """Kinds of exception that keep their kind on the way out of a job, the particular before the general"""
 PR_SET_PDEATHSIG = 1
@@ -139,7 +141,7 @@ class Jobs:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                env={**os.environ, **threads, **mark},
+                env={**os.environ, **threads, **ONE_BLAS_THREAD, **mark},
                 start_new_session=True,
                 pass_fds=descriptors,
             )

@@ -42,7 +42,8 @@ class CaptureError(ValueError):
 def area(progress, size: Size, names: tuple[str, ...], out: Path):
     progress(1, 2, "half")
     (out / "area.txt").write_text(str(size.width * size.height))
-    return {"names": list(names), "threads": os.environ["NUMBA_NUM_THREADS"], "pid": os.getpid()}
+    threads = {name: os.environ[name] for name in ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    return {"names": list(names), "threads": threads, "pid": os.getpid()}
 
 def bad_input(progress): raise CaptureError("cam03 has no frames")
 def missing(progress): raise FileNotFoundError(2, "no such thing", "cam03.mp4")
@@ -123,7 +124,7 @@ def test_arguments_results_and_progress_cross_over(jobs, work, tmp_path):
     assert (tmp_path / "area.txt").read_text() == "6"
     assert seen == [(1.0, 2.0, "half")]
     assert done.value["names"] == ["cam00", "cam01"]
-    assert done.value["threads"] == "3"
+    assert done.value["threads"] == {"NUMBA_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "1"}
     assert done.value["pid"] != os.getpid()
     assert done.peak_memory_bytes > 1 << 20
     assert done.cpu.endswith(" lanes")
