@@ -1,8 +1,8 @@
 """The line between a run and the server of the workflow engine.
 
 One thread posts what the dashboard shows, hears when somebody cancels the run there, and notices when the server has
-gone. Nothing that happens to the server may hold up the run: a post that fails is lost, and a run whose server has gone
-ends by itself.
+gone. Nothing that happens to the server may hold up the run: what a busy server does not take is sent again with the
+next posts, what it refuses is lost, and a run whose server has gone ends by itself.
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ ENDING_SECONDS = 12.0
 FLUSH_SECONDS = 10.0
 """For the last posts, when the run is over"""
 REQUEST_SECONDS = 10.0
+BUSY = (429, 503)
+"""Answers of a server that asks to be asked again, as when its database is locked"""
+LAST_TRIES = 5
+"""To send the last posts"""
 
 Post = Callable[[SyncPrefectClient], object]
 
@@ -84,27 +88,39 @@ class Link:
             while not self._closed.is_set():
                 self._wake.wait(LISTEN_SECONDS)
                 self._wake.clear()
-                if self._reached(client, lambda client: _hear(client, flow_run, jobs)):
+                if self._taken(client, lambda client: _hear(client, flow_run, jobs)):
                     self._send(client)
                 elif not self._closed.is_set() and self._has_gone():
                     self._leave(str(client.api_url), jobs)
                     return
-            self._send(client)
+            for _ in range(LAST_TRIES):
+                if self._send(client) or self._died():
+                    return
+                time.sleep(LISTEN_SECONDS / 2)
 
-    def _send(self, client: SyncPrefectClient) -> None:
+    def _send(self, client: SyncPrefectClient) -> bool:
+        """Whether nothing is left to be sent."""
         with self._guard:
-            posts, self._posts = list(self._posts.values()), {}
-        for post in posts:
-            if not self._reached(client, post):
-                return
+            posts, self._posts = self._posts, {}
+        while posts:
+            name = next(iter(posts))
+            if not self._taken(client, posts[name]):
+                with self._guard:
+                    self._posts = {**posts, **self._posts}
+                return False
+            del posts[name]
+        return True
 
-    def _reached(self, client: SyncPrefectClient, post: Post) -> bool:
-        """Whether the server answered, if only with a refusal."""
+    def _taken(self, client: SyncPrefectClient, post: Post) -> bool:
+        """Whether the server took it, or refused it for good."""
         try:
             post(client)
         except Exception as error:  # whatever a server or the way to it may do
-            if getattr(error, "response", None) is None:
+            response = getattr(error, "response", None)
+            if response is None:
                 return False
+            self._heard = time.monotonic()
+            return response.status_code not in BUSY
         self._heard = time.monotonic()
         return True
 

@@ -42,8 +42,17 @@ class Api:
     def __call__(self, path: str, body: Any = None) -> Any:
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(f"{self.url}{path}", data, {"Content-Type": "application/json"})
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            return json.load(answer)
+        return wait_for(lambda: self._answer(request), seconds=60)[0]
+
+    def _answer(self, request: urllib.request.Request) -> list[Any]:
+        """Nothing from a busy server: its own clients ask again, too."""
+        try:
+            with urllib.request.urlopen(request, timeout=60) as answer:
+                return [json.load(answer)]
+        except urllib.error.HTTPError as error:
+            if error.code != 503:
+                raise
+            return []
 
     def deployment(self, name: str) -> dict[str, Any]:
         (found,) = [item for item in self("/deployments/filter", {}) if item["name"] == name]
