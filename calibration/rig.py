@@ -37,6 +37,9 @@ class Camera:
     """OpenCV's k1 k2 p1 p2 [k3 ...]; empty for a pinhole camera"""
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Linear-light factors r g b that bring this camera's pictures to the rig's common colour"""
+    shading: tuple[float, float] = (0.0, 0.0)
+    """k1, k2: light falls off by exp(k1 r^2 + k2 r^4), of mean 1 over the picture; r is the distance from the principal
+    point at depth 1, r = 1 in the corner"""
 
     def __post_init__(self) -> None:
         if not _is_rigid(self.camera_from_world):
@@ -45,7 +48,17 @@ class Camera:
             raise ValueError(
                 f"camera {self.name!r}: OpenCV lens models have 4, 5 or 8 coefficients, not {len(self.distortion)}"
             )
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, *self.gains, self.width, self.height)
+        numbers = (
+            self.fx,
+            self.fy,
+            self.cx,
+            self.cy,
+            *self.distortion,
+            *self.gains,
+            *self.shading,
+            self.width,
+            self.height,
+        )
         if not np.all(np.abs([*numbers, *self.camera_from_world[:3, 3]]) <= MOST_NUMBER):
             raise ValueError(
                 f"camera {self.name!r}: intrinsics, lens, gains, size and place must be finite, up to {MOST_NUMBER:g}, "
@@ -207,7 +220,7 @@ def _is_rigid(pose: np.ndarray) -> bool:
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
     numbers = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    lists = {"distortion": list(camera.distortion), "gains": list(camera.gains)}
+    lists = {"distortion": list(camera.distortion), "gains": list(camera.gains), "shading": list(camera.shading)}
     return {"name": camera.name, **numbers, **lists, "camera_from_world": camera.camera_from_world.tolist()}
 
 
@@ -226,4 +239,5 @@ def _camera_from_json(item: Mapping[str, Any]) -> Camera:
         camera_from_world=np.asarray(item["camera_from_world"], dtype=np.float64),
         distortion=tuple(item["distortion"]),
         gains=tuple(item["gains"]),
+        shading=tuple(item.get("shading", (0.0, 0.0))),
     )

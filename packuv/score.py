@@ -35,11 +35,11 @@ class Score:
     psnr_db: float | None
     """Against the picture as filmed"""
     ssim: float
-    psnr_rig_db: float | None
-    """Against the picture in the rig's common colour, as the fit sees it"""
-    ssim_rig: float
+    psnr_calibrated_db: float | None
+    """Against the picture as filmed, the render as the camera would film it: its exposure, gain and lens shading"""
+    ssim_calibrated: float
     psnr_own_db: float | None
-    """Against the picture as filmed, the render with the one gain per channel that fits this picture best"""
+    """Against the picture as filmed, the calibrated render with the one gain per channel that fits this picture best"""
     ssim_own: float
     flicker: float | None
     """Mean absolute change, since the camera's last frame, of the difference between render and truth in the rig's
@@ -63,18 +63,20 @@ def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
         gaussians = scene.gaussians(frame, into=gaussians)
         time_ns = int(scene.header.times_ns[frame])
         for index, camera in enumerate(views.cameras):
-            pixels, balanced = views.pixels(index, frame), views.picture(index, frame)
-            if pixels is None or balanced is None:
+            truth = views.filmed(index, frame)
+            if truth is None:
                 continue
-            truth = np.ascontiguousarray(pixels.transpose(2, 0, 1), dtype=np.float32) / 255
             drawn = artist.draw(gaussians, camera)
-            error, before = drawn - balanced, last.get(camera.name)
+            shown = views.response(index, frame).shown(drawn)
+            error, before = shown - truth, last.get(camera.name)
             flicker = None if before is None else float(np.abs(error - before).mean())
             last[camera.name] = error
             held_out = camera.name in scene.header.held_out
-            filmed, rig, own = _compare(drawn, truth, balanced)
-            scores.append(Score(frame, time_ns, camera.name, held_out, *filmed, *rig, *own, flicker))
-        progress(frame + 1, len(scene), f"{_mean([s.psnr_rig_db for s in scores]) or 0:.2f} dB")
+            raw, calibrated, own = (
+                _likeness(picture, truth) for picture in (np.clip(drawn, 0, 1), shown, with_own_gain(shown, truth))
+            )
+            scores.append(Score(frame, time_ns, camera.name, held_out, *raw, *calibrated, *own, flicker))
+        progress(frame + 1, len(scene), f"{_mean([s.psnr_calibrated_db for s in scores]) or 0:.2f} dB")
     return scores
 
 
@@ -84,16 +86,17 @@ def segment_starts(scene: Scene) -> list[int]:
 
 
 def write_pictures(folder: Path, scene: Scene, views: Views, chosen: Sequence[tuple[str, int, str]]) -> None:
-    """Render and truth of chosen cameras and frames, in the rig's common colour; index.json says why each was."""
+    """Render, as the camera would film it, and truth of chosen cameras and frames; index.json says why each was."""
     folder.mkdir()
     artist, index = Artist(scene), []
     for camera, frame, why in sorted(chosen, key=lambda choice: choice[1]):
         place = views.names.index(camera)
-        truth = views.picture(place, frame)
+        truth = views.filmed(place, frame)
         if truth is None:
             continue
+        drawn = artist.draw(scene.gaussians(frame), views.cameras[place])
         names = {kind: f"{camera}_{frame:06d}_{kind}.png" for kind in ("render", "truth")}
-        write_picture(folder / names["render"], artist.draw(scene.gaussians(frame), views.cameras[place]))
+        write_picture(folder / names["render"], views.response(place, frame).shown(drawn))
         write_picture(folder / names["truth"], truth)
         index.append({"camera": camera, "frame": frame, "choice": why, **names})
     save_json(folder / "index.json", {"pictures": index})
@@ -107,21 +110,13 @@ class Artist:
         self._arena = Arena()
 
     def draw(self, gaussians: Gaussians, camera: PinholeCamera) -> np.ndarray:
-        """float32 [3, H, W] in [0, 1], in the rig's common colour."""
+        """float32 [3, H, W], in the rig's common colour; lamps are brighter than 1."""
         rendering = render(gaussians, camera, options=self._options, arena=self._arena)
-        return cast(np.ndarray, np.clip(rendering.colour, 0, 1))
+        return cast(np.ndarray, rendering.colour)
 
 
 Likeness = tuple[float | None, float]
 """PSNR in dB, None where two pictures are equal, and SSIM"""
-
-
-def _compare(picture: np.ndarray, truth: np.ndarray, balanced: np.ndarray) -> tuple[Likeness, Likeness, Likeness]:
-    """Of a render to what was filmed, to that in the rig's colour, and to what was filmed after its own gain."""
-    as_filmed = _likeness(picture, truth)
-    # A camera that is held out has no gain: what it filmed is the rig's colour.
-    in_rig = as_filmed if np.array_equal(truth, balanced) else _likeness(picture, balanced)
-    return as_filmed, in_rig, _likeness(with_own_gain(picture, truth), truth)
 
 
 def _likeness(picture: np.ndarray, truth: np.ndarray) -> Likeness:

@@ -29,7 +29,7 @@ from packuv.fit.start.first import first_gaussians, neighbour_distance, round_ga
 from packuv.fit.start.hull import hull_points, in_hull
 from packuv.fit.start.points import Points, drawn, no_points
 from packuv.fit.start.shell import Shell, sweep_shell
-from packuv.footage import Views
+from packuv.footage import Views, as_planes
 from packuv.gaussians.codes import OPACITY_RANGE, Quantizer, attribute_values
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, with_canonical_axes
 from packuv.motion import Still
@@ -87,12 +87,12 @@ def fit_first(
     """
     started = time.monotonic()
     shots = find_shots(views, instant)
-    still_shots = [Shot(views.cameras[s.camera], views.balanced(s.camera, s.pixels), known=s.known) for s in stills]
+    still_shots = [_still_shot(views, still) for still in stills]
     with_background = len(still_shots) >= len(shots)
     first = still_shots if with_background else shots
     bounds = find_bounds(views.cameras, near_share=options.near_share)
     rng = np.random.default_rng([options.seed, instant, 0])
-    cameras, targets = [shot.camera for shot in first], [shot.target for shot in first]
+    cameras, targets = [shot.camera for shot in first], [shot.response.undone(shot.target) for shot in first]
     shell = sweep_shell(cameras, targets, bounds=bounds, options=options.shell) if options.shell.enabled else None
     start = first_gaussians(cameras, targets, bounds=bounds, surface=_surface(shell, points, options),
                             options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
@@ -170,13 +170,18 @@ def fit_next(
     return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, losses, solver))
 
 
+def _still_shot(views: Views, still: Still) -> Shot:
+    response = views.response(still.camera, None)
+    return Shot(views.cameras[still.camera], as_planes(still.pixels), response, known=still.known)
+
+
 def _before_background(
     views: Views, instant: int, stills: Sequence[Still], motion: MotionOptions
 ) -> list[np.ndarray | None]:
     """What each camera's picture shows that its background lacks, bool [H, W]; None without one of the two."""
     masks: list[np.ndarray | None] = [None] * len(views.cameras)
     for still in stills:
-        pixels = views.pixels(still.camera, instant)
+        pixels = views.steady(still.camera, instant)
         masks[still.camera] = None if pixels is None else difference(still.pixels, pixels, motion)
     return masks
 
@@ -216,7 +221,7 @@ def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, o
     def loss(degree: int) -> float:
         cut = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
         drawn = (render(cut, s.camera, options=raster, arena=arena).colour for s in shots)
-        values = [photometric_loss(picture, shot.target, options=options.photometric).value
+        values = [photometric_loss(shot.response.shown(picture), shot.target, options=options.photometric).value
                   for picture, shot in zip(drawn, shots, strict=True)]  # fmt: skip
         return float(np.mean(values))
 

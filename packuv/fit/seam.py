@@ -54,8 +54,8 @@ def _error(
     gaussians: Gaussians, views: Views, index: int, instant: int, near: float, arena: Arena
 ) -> np.ndarray | None:
     """Render minus picture, float32 [3, H, W]; None where the camera has no picture."""
-    picture = views.picture(index, instant)
-    if picture is None:
+    filmed = views.filmed(index, instant)
+    if filmed is None:
         return None
     drawn = render(gaussians, views.cameras[index], options=RasterOptions(near), arena=arena)
-    return np.asarray(np.clip(drawn.colour, 0, 1) - picture)
+    return np.asarray(views.response(index, instant).shown(drawn.colour) - filmed)

@@ -13,7 +13,8 @@ from packuv.fit.depth import SparseDepth
 from packuv.fit.labels import dynamic_labels
 from packuv.fit.options import ChangeOptions
 from packuv.fit.start.bounds import Bounds
-from packuv.footage import Views
+from packuv.footage import Response, Views
+from packuv.footage.response import PLAIN
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import Gaussians
 
@@ -24,7 +25,9 @@ class Shot:
 
     camera: PinholeCamera
     target: np.ndarray
-    """float32 [3, H, W] in [0, 1]"""
+    """float32 [3, H, W] in [0, 1], as filmed"""
+    response: Response = PLAIN
+    """What the camera makes of the rig's colours"""
     tiles: np.ndarray | None = None
     """bool [tiles_y, tiles_x] where the picture counts; None: everywhere"""
     known: np.ndarray | None = None
@@ -41,7 +44,8 @@ def halved(shot: Shot) -> Shot:
     known = None
     if shot.known is not None:
         known = cv2.resize(shot.known.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    return Shot(camera, np.ascontiguousarray(small.transpose(2, 0, 1)), known=known)
+    response = shot.response.scaled(camera.width / shot.camera.width, camera.height / shot.camera.height)
+    return Shot(camera, np.ascontiguousarray(small.transpose(2, 0, 1)), response, known=known)
 
 
 def find_shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | None = None) -> list[Shot]:
@@ -50,9 +54,9 @@ def find_shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | 
     for index, camera in enumerate(views.cameras):
         if masks is not None and (mask := masks[index]) is not None and not mask.any():
             continue
-        target = views.picture(index, instant)
+        target = views.filmed(index, instant)
         if target is not None:
-            shots.append(Shot(camera, target))
+            shots.append(Shot(camera, target, views.response(index, instant)))
     if masks is None and len(shots) < 2:
         raise ValueError(f"instant {instant} has pictures of {len(shots)} cameras to fit, but needs two or more; "
                          "choose another range with --frames")  # fmt: skip

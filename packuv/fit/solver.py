@@ -15,7 +15,7 @@ from packuv.fit.options import FrameOptions, SolverOptions
 from packuv.fit.shots import Shot
 from packuv.fit.start.bounds import Bounds
 from packuv.fit.terms import Pull, Seen, pulls, summed
-from packuv.footage import Views
+from packuv.footage import Response, Views
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import ALPHA_MIN, ATTRIBUTES, Gaussians, opacity, rows_of
 from packuv.progress import Ticks
@@ -177,11 +177,12 @@ class Solver:
         rendering = render(self._decoded(), shot.camera, options=raster, tiles=shot.tiles, arena=self._arena)
         moving = self.rows & (rendering.visible > 0)
         behind = self._behind(shot.target) if opaque else None
-        picture = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
+        colour = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
+        picture = shot.response.shown(colour)
         # What is not known is taken for right as it is.
         target = shot.target if shot.known is None else np.where(shot.known, shot.target, picture)
         found = pulls(Seen(rendering, picture, target, shot, self.model.gaussians, moving, self.bounds.radius), options)
-        drawn = self._carried_back(rendering, found, behind)
+        drawn = self._carried_back(rendering, found, shot.response, behind)
         self.gradient.add(drawn.means2d, rendering.visible, shot.camera.width, shot.camera.height)
         values = {name: getattr(drawn, name) for name in ATTRIBUTES}
         for pull in found.values():
@@ -193,11 +194,13 @@ class Solver:
         self.done += 1
         return {name: pull.value for name, pull in found.items()}
 
-    def _carried_back(self, rendering: Rendering, found: Mapping[str, Pull], behind: np.ndarray | None) -> Gradients:
-        """Derivatives by the Gaussians of what pulls at the rendering, before the colour `behind` it."""
-        d_colour = summed(pull.colour for pull in found.values())
+    def _carried_back(
+        self, rendering: Rendering, found: Mapping[str, Pull], response: Response, behind: np.ndarray | None
+    ) -> Gradients:
+        """Derivatives by the Gaussians of what pulls at what is shown, before the colour `behind` them."""
+        d_shown = summed(pull.colour for pull in found.values())
         d_depth, d_alpha = (summed(getattr(pull, name) for pull in found.values()) for name in ("depth", "alpha"))
-        d_colour = np.zeros_like(rendering.colour) if d_colour is None else d_colour
+        d_colour = np.zeros_like(rendering.colour) if d_shown is None else response.carried(d_shown)
         if behind is not None:
             through = (d_colour * behind).sum(axis=0)
             d_alpha = (np.zeros_like(rendering.alpha) if d_alpha is None else d_alpha) - through

@@ -24,7 +24,7 @@ class Seen:
 
     rendering: Rendering
     picture: np.ndarray
-    """float32 [3, H, W]: the rendering, with what lies behind it"""
+    """float32 [3, H, W]: what the camera makes of the rendering with what lies behind it"""
     target: np.ndarray
     """float32 [3, H, W]; the picture itself where nothing is known"""
     shot: Shot
@@ -42,7 +42,7 @@ class Pull:
 
     value: float
     colour: np.ndarray | None = None
-    """float32 [3, H, W]"""
+    """float32 [3, H, W], by the picture"""
     depth: np.ndarray | None = None
     """float32 [H, W]"""
     alpha: np.ndarray | None = None

@@ -11,10 +11,11 @@ import numpy as np
 
 from packuv.bounds import field, finite, items, numbers
 from packuv.camera import PinholeCamera
-from packuv.colour import linear_from_srgb, srgb_from_linear
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """Coefficient counts that OpenCV's lens model knows, see `LensCamera.distortion`."""
+MOST_SHADING = 2.0
+"""Of a coefficient of lens shading: corners at a seventh of the light, or seven times it"""
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,9 @@ class LensCamera:
     """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; empty for a pinhole camera"""
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Linear-light factors r g b that bring this camera to the rig's common colour"""
+    shading: tuple[float, float] = (0.0, 0.0)
+    """k1, k2: light falls off by exp(k1 r^2 + k2 r^4), of mean 1 over the picture; r is the distance from the principal
+    point at depth 1, r = 1 in the corner"""
 
     def __post_init__(self) -> None:
         if len(self.distortion) not in DISTORTION_LENGTHS:
@@ -36,11 +40,16 @@ class LensCamera:
             )
         if len(self.gains) != 3 or not all(np.isfinite(gain) and gain > 0 for gain in self.gains):
             raise ValueError(f"camera {self.pinhole.name!r}: gains must be three positive numbers, not {self.gains}")
+        if len(self.shading) != 2 or not all(abs(k) <= MOST_SHADING for k in self.shading):
+            raise ValueError(
+                f"camera {self.pinhole.name!r}: shading must be two numbers within {MOST_SHADING}, not {self.shading}"
+            )
 
     def to_json(self) -> dict[str, Any]:
         # All floats, so that a round trip through JSON gives the same text: caches compare by it.
         floats = {key: float(getattr(self.pinhole, key)) for key in ("fx", "fy", "cx", "cy")}
         lens = {"distortion": [float(k) for k in self.distortion], "gains": [float(gain) for gain in self.gains]}
+        lens["shading"] = [float(k) for k in self.shading]
         return {**self.pinhole.to_json(), **floats, **lens}
 
     @classmethod
@@ -49,14 +58,8 @@ class LensCamera:
         what = f"camera {pinhole.name!r}"
         red, green, blue = numbers(field(data, "gains", what), f"{what}: gains", (3,)).tolist()
         lens = items(field(data, "distortion", what), f"{what}: distortion", most=max(DISTORTION_LENGTHS))
-        return cls(pinhole, tuple(finite(k, f"{what}: distortion") for k in lens), (red, green, blue))
-
-
-def gain_table(gains: tuple[float, float, float]) -> np.ndarray:
-    """float32 [3, 256]: sRGB in [0, 1] of each 8-bit sRGB value times a gain in linear light."""
-    light = linear_from_srgb(np.arange(256) / 255) * np.asarray(gains)[:, None]  # [3, 256]
-    table: np.ndarray = np.clip(srgb_from_linear(light), 0, 1).astype(np.float32)
-    return table
+        k1, k2 = numbers(data.get("shading", (0.0, 0.0)), f"{what}: shading", (2,)).tolist()
+        return cls(pinhole, tuple(finite(k, f"{what}: distortion") for k in lens), (red, green, blue), (k1, k2))
 
 
 def undistorted_camera(lens: LensCamera) -> PinholeCamera:

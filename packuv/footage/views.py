@@ -1,4 +1,5 @@
-"""Pictures on demand: exact decoding per camera, and the undistorted, colour-balanced views that a fit sees.
+"""Pictures on demand: exact decoding per camera, and the undistorted views that a fit sees, with what the camera makes
+of the rig's colours.
 
 Nothing is written to disk. A picture that differs from the one asked for is never returned: every decoded frame
 must carry the timestamp that the container's packets give to that frame number.
@@ -18,13 +19,14 @@ import cv2
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.footage.lens import LensCamera, gain_table, undistorted_camera, undistortion_maps
+from packuv.footage.lens import LensCamera, undistorted_camera, undistortion_maps
 from packuv.footage.reader import FrameReader
+from packuv.footage.response import GAMMA, OFFSET, Response
 from packuv.footage.transfer import Transfer
 
 
 class Views:
-    """What a fit and an evaluation see: undistorted, colour-balanced pictures by camera and instant.
+    """What a fit and an evaluation see: undistorted pictures by camera and instant, and each camera's response.
 
     A camera is an index into `cameras`, an instant a row of `frames`. Pictures of the last instants stay in memory
     as bytes, up to `cache_bytes`; reading instants in ascending order decodes every frame once.
@@ -41,13 +43,16 @@ class Views:
         *,
         max_width: int | None = None,
         transfer: Transfer | None = None,
+        light: np.ndarray | None = None,
         cache_bytes: int = 1 << 30,
         reader: FrameReader | None = None,
     ) -> None:
         """`frames` is int [T, C]: frame number in the video of camera c at instant t, -1 where it has none.
 
-        Pictures wider than `max_width` are scaled down to it. `transfer` is what the code values of all videos mean,
-        None what each is tagged with. `reader`, which has its own, is shared with others if given.
+        `light`, float [T, C, 3], is the natural logarithm of what the light of the instant and the camera's own
+        exposure make of linear light, None where both are steady. Pictures wider than `max_width` are scaled down to
+        it. `transfer` is what the code values of all videos mean, None what each is tagged with. `reader`, which has
+        its own, is shared with others if given.
         Raises ValueError where shapes disagree, a camera has no video, or a lens cannot be undistorted.
         """
         names = [lens.pinhole.name for lens in lenses]
@@ -55,7 +60,10 @@ class Views:
             raise ValueError(f"frames must be [T, C] with C = {len(lenses)} cameras, but are {frames.shape}")
         if missing := sorted(set(names) - set(videos)):
             raise ValueError(f"cameras {missing} have no video; there are videos of {sorted(videos)}")
+        if light is not None and light.shape != (*frames.shape, 3):
+            raise ValueError(f"light must be {(*frames.shape, 3)} as the frames are, but is {light.shape}")
         self.lenses = tuple(lenses)
+        self.light = None if light is None else light.astype(np.float32)
         self.frames = frames.astype(np.int32)
         self.max_width = max_width
         self.transfer = transfer
@@ -64,7 +72,6 @@ class Views:
         undistorted = [undistorted_camera(lens) for lens in lenses]
         self._maps = [undistortion_maps(lens, camera) for lens, camera in zip(lenses, undistorted, strict=True)]
         self.cameras = tuple(_limited(camera, max_width) for camera in undistorted)
-        self._tables = [gain_table(lens.gains) for lens in lenses]
         self._cache: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
         self._cache_bytes = cache_bytes
         self._cached_bytes = 0
@@ -78,17 +85,30 @@ class Views:
         """Number of instants, T."""
         return len(self.frames)
 
-    def picture(self, camera: int, instant: int) -> np.ndarray | None:
-        """Colour-balanced picture, float32 [3, H, W] in [0, 1], or None where the camera has no frame."""
+    def filmed(self, camera: int, instant: int) -> np.ndarray | None:
+        """Undistorted picture in the camera's own colours, float32 [3, H, W] in [0, 1], or None without a frame."""
         pixels = self.pixels(camera, instant)
-        return None if pixels is None else self.balanced(camera, pixels)
+        return None if pixels is None else as_planes(pixels)
 
-    def balanced(self, camera: int, pixels: np.ndarray) -> np.ndarray:
-        """Pixels of a camera, uint8 [H, W, 3], in the rig's common colour: float32 [3, H, W] in [0, 1]."""
-        picture = np.empty((3, *pixels.shape[:2]), dtype=np.float32)
-        for channel, table in enumerate(self._tables[camera]):
-            picture[channel] = cv2.LUT(cv2.extractChannel(pixels, channel), table)
-        return picture
+    def picture(self, camera: int, instant: int) -> np.ndarray | None:
+        """Picture in the rig's common colour and steady light, float32 [3, H, W], or None where there is no frame."""
+        filmed = self.filmed(camera, instant)
+        return None if filmed is None else self.response(camera, instant).undone(filmed)
+
+    def response(self, camera: int, instant: int | None) -> Response:
+        """What the camera makes of the rig's colours at an instant; None: in steady light."""
+        light = None if self.light is None or instant is None else self.light[instant, camera]
+        return Response.of(self.lenses[camera], self.cameras[camera], light)
+
+    def steady(self, camera: int, instant: int, *, remember: bool = True) -> np.ndarray | None:
+        """`pixels` as steady light and exposure would have them: what differs between two of them has moved."""
+        pixels = self.pixels(camera, instant, remember=remember)
+        if pixels is None or self.light is None or not self.light[instant, camera].any():
+            return pixels
+        factors = np.exp(self.light[instant, camera].astype(np.float64) / GAMMA)
+        table = (np.arange(256)[:, None] / 255 + OFFSET) / factors - OFFSET  # [256, 3]
+        steady: np.ndarray = cv2.LUT(pixels, np.rint(255 * np.clip(table, 0, 1)).astype(np.uint8)[None])
+        return steady
 
     def pixels(self, camera: int, instant: int, *, remember: bool = True) -> np.ndarray | None:
         """Undistorted picture in the camera's own colours, uint8 [H, W, 3], read-only, or None."""
@@ -114,6 +134,7 @@ class Views:
             "frames": _packed(self.frames),
             "max_width": self.max_width,
             "transfer": self.transfer,
+            "light": None if self.light is None else _text(self.light),
         }
 
     @classmethod
@@ -123,7 +144,8 @@ class Views:
         frames = _unpacked(spec["frames"], len(lenses))
         videos = {name: Path(path) for name, path in spec["videos"].items()}
         transfer = Transfer(spec["transfer"]) if spec["transfer"] else None
-        return cls(videos, frames, lenses, max_width=spec["max_width"], transfer=transfer)
+        light = None if spec["light"] is None else _numbers(spec["light"], "<f4").reshape(*frames.shape, 3)
+        return cls(videos, frames, lenses, max_width=spec["max_width"], transfer=transfer, light=light)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (Views.from_spec, (self.to_spec(),))
@@ -152,16 +174,30 @@ class Views:
                 self._cached_bytes -= self._cache.popitem(last=False)[1].nbytes
 
 
+def as_planes(pixels: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3] as float32 [3, H, W] in [0, 1]."""
+    planes = np.ascontiguousarray(pixels.transpose(2, 0, 1), dtype=np.float32)
+    planes /= 255
+    return planes
+
+
 def _packed(frames: np.ndarray) -> str:
-    """Steps between instants, deflated: frame numbers mostly count by one, so hours fit into a line of JSON."""
+    """Steps between instants, so that hours fit into a line of JSON: frame numbers mostly count by one."""
     steps = np.diff(frames, axis=0, prepend=np.zeros_like(frames[:1]))
-    return base64.b64encode(zlib.compress(steps.T.astype("<i4").tobytes(), 6)).decode()
+    return _text(steps.T.astype("<i4"))
 
 
 def _unpacked(text: str, cameras: int) -> np.ndarray:
     """int32 [T, cameras]; the inverse of `_packed`."""
-    steps = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype="<i4").reshape(cameras, -1)
-    return np.cumsum(steps.T, axis=0, dtype=np.int32)
+    return np.cumsum(_numbers(text, "<i4").reshape(cameras, -1).T, axis=0, dtype=np.int32)
+
+
+def _text(numbers: np.ndarray) -> str:
+    return base64.b64encode(zlib.compress(numbers.tobytes(), 6)).decode()
+
+
+def _numbers(text: str, kind: str) -> np.ndarray:
+    return np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=kind)
 
 
 def _limited(camera: PinholeCamera, max_width: int | None) -> PinholeCamera:

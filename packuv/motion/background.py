@@ -43,7 +43,7 @@ class Still:
     camera: int
     """Index into the views' cameras"""
     pixels: np.ndarray
-    """uint8 [H, W, 3], in the camera's own colours"""
+    """uint8 [H, W, 3], in the camera's own colours and steady light"""
     known: np.ndarray
     """bool [H, W]: most instants agree on it"""
 
@@ -55,7 +55,7 @@ def find_background(
     instants = np.unique(np.linspace(0, len(views) - 1, min(options.instants, len(views))).round().astype(int))
     stills = []
     for camera in range(len(views.cameras)):
-        pictures = [views.pixels(camera, int(instant), remember=False) for instant in instants]
+        pictures = [views.steady(camera, int(instant), remember=False) for instant in instants]
         found = [picture for picture in pictures if picture is not None]
         if len(found) >= least:
             stills.append(_still(camera, np.stack(found), options))

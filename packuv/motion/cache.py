@@ -114,7 +114,7 @@ def _measure_camera(views: Views, camera: int, files: _CameraFiles, options: Mot
 
 def _pixels(views: Views, camera: int, instant: int) -> np.ndarray:
     """A picture that is there, left out of the views' memory: one pass needs it once."""
-    pixels = views.pixels(camera, instant, remember=False)
+    pixels = views.steady(camera, instant, remember=False)
     if pixels is None:
         raise ValueError(f"camera {views.names[camera]!r} has no picture at instant {instant}")
     return pixels

@@ -170,7 +170,7 @@ def changed_between(views: Views, camera: int, first: int, last: int, options: M
 
     None where the camera lacks one of the two pictures. Slow motion that no single step shows adds up to a change here.
     """
-    before, after = views.pixels(camera, first), views.pixels(camera, last)
+    before, after = views.steady(camera, first), views.steady(camera, last)
     return None if before is None or after is None else difference(before, after, options)
 
 

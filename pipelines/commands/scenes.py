@@ -178,7 +178,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _scores_text(facts: Mapping[str, Any]) -> str:
-    kinds = {"_rig": "common colour", "": "as filmed", "_own": "own gain"}
+    kinds = {"_calibrated": "calibrated", "": "raw", "_own": "own gain"}
     lines = [f"{'camera':<12}" + "".join(f"{text:>22}" for text in kinds.values())]
     for name, means in {**facts["by_camera"], "mean": facts["mean"]}.items():
         lines.append(f"{name:<12}" + "".join(f"{_score_text(means, kind):>22}" for kind in kinds))

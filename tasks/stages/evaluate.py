@@ -129,8 +129,13 @@ def _rows(groups: FrameGroups, times_ns: np.ndarray) -> np.ndarray:
 
 
 def frame_scores(scores: Sequence[Score]) -> tuple[FrameScore, ...]:
-    """Scores in the rig's common colour, as the report shows them."""
+    """Scores of renders as the cameras would film them, as the report shows them."""
     return tuple(
-        FrameScore(item.camera, item.frame, math.inf if item.psnr_rig_db is None else item.psnr_rig_db, item.ssim_rig)
+        FrameScore(
+            item.camera,
+            item.frame,
+            math.inf if item.psnr_calibrated_db is None else item.psnr_calibrated_db,
+            item.ssim_calibrated,
+        )
         for item in scores
     )

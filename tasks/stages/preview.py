@@ -45,10 +45,10 @@ class Preview(Stage):
         gaussians, instant = key.quantizer.decode(segment.frame(last)), segment.first + last
         options, arena, levels = RasterOptions(key.bounds.near), Arena(), dict[str, float | None]()
         for index, camera in enumerate(views.cameras):
-            truth = views.picture(index, instant)
+            truth = views.filmed(index, instant)
             if truth is None:
                 continue
-            drawn = np.clip(render(gaussians, camera, options=options, arena=arena).colour, 0, 1)
+            drawn = views.response(index, instant).shown(render(gaussians, camera, options=options, arena=arena).colour)
             level = psnr(drawn, truth)
             if not levels:
                 _write(work, truth, drawn)

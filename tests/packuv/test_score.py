@@ -18,8 +18,8 @@ def test_the_table_has_the_columns_that_stores_hold():
             ("held_out", pa.bool_()),
             ("psnr_db", pa.float64()),
             ("ssim", pa.float64()),
-            ("psnr_rig_db", pa.float64()),
-            ("ssim_rig", pa.float64()),
+            ("psnr_calibrated_db", pa.float64()),
+            ("ssim_calibrated", pa.float64()),
             ("psnr_own_db", pa.float64()),
             ("ssim_own", pa.float64()),
             ("flicker", pa.float64()),
@@ -29,4 +29,4 @@ def test_the_table_has_the_columns_that_stores_hold():
 
 def test_every_field_is_a_column_and_every_figure_has_a_mean():
     assert SCHEMA.names == [field.name for field in fields(Score)]
-    assert FIGURES == ("psnr_db", "ssim", "psnr_rig_db", "ssim_rig", "psnr_own_db", "ssim_own", "flicker")
+    assert FIGURES == ("psnr_db", "ssim", "psnr_calibrated_db", "ssim_calibrated", "psnr_own_db", "ssim_own", "flicker")

@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
-from packuv.footage.lens import LensCamera, gain_table, undistorted_camera
+from packuv.footage.lens import LensCamera, undistorted_camera
 from packuv.footage.reader import FrameReader, packet_seconds
-from packuv.footage.views import Views, _packed, _unpacked
+from packuv.footage.views import Views, _packed, _unpacked, as_planes
 from tests.support.needs import needs_ffmpeg
 
 WIDTH, HEIGHT, COUNT = 96, 64, 40
@@ -175,8 +175,9 @@ def test_views_say_none_where_a_camera_has_no_frame(video: Path) -> None:
 
 
 def test_views_survive_pickle_and_json(video: Path) -> None:
-    lens = LensCamera(camera(), (-0.1, 0.02, 0.001, -0.002), (1.1, 0.9, 1.0))
-    views = Views({"a": video}, np.array([[0], [-1], [5]]), [lens], max_width=48)
+    lens = LensCamera(camera(), (-0.1, 0.02, 0.001, -0.002), (1.1, 0.9, 1.0), (-0.3, 0.05))
+    light = np.linspace(-0.1, 0.1, 9).reshape(3, 1, 3)
+    views = Views({"a": video}, np.array([[0], [-1], [5]]), [lens], max_width=48, light=light)
     again = [pickle.loads(pickle.dumps(views)), Views.from_spec(json.loads(json.dumps(views.to_spec())))]
     for other in again:
         assert other.names == views.names
@@ -192,13 +193,21 @@ def test_the_cache_keeps_within_its_bytes_and_changes_nothing(video: Path) -> No
         assert small._cached_bytes == sum(p.nbytes for p in small._cache.values()) <= small._cache_bytes
 
 
-def test_gain_one_is_the_identity_and_gains_act_on_linear_light() -> None:
-    assert np.allclose(gain_table((1, 1, 1)), np.arange(256) / 255, atol=1e-6)
-    table = gain_table((0.5, 1.0, 4.0))
-    # sRGB 188 is half of full light; four times anything from 137 up is white.
-    assert abs(table[0, 255] - 188 / 255) < 1 / 255
-    assert table[2, 140:].min() == 1
-    assert (np.diff(table, axis=1) >= 0).all()
+def test_steady_pictures_undo_the_light_of_the_instant(video: Path) -> None:
+    frames = np.array([[3], [4]])
+    light = np.zeros((2, 1, 3))
+    light[1, 0] = np.log([1.2, 1.0, 0.8])
+    views = Views({"a": video}, frames, [LensCamera(camera())], light=light)
+    assert np.array_equal(views.steady(0, 0), numbered()[3])
+    filmed, steady = views.pixels(0, 1), views.steady(0, 1)
+    assert filmed is not None
+    assert steady is not None
+    assert np.array_equal(steady[..., 1], filmed[..., 1])
+    again = views.response(0, 1).shown(as_planes(steady)) * 255
+    bright = (steady > 0) & (steady < 255)
+    assert np.abs(again.transpose(1, 2, 0) - filmed)[bright].max() <= 0.6  # steady ones are rounded to bytes
+    picture = views.picture(0, 1)
+    assert np.allclose(picture * 255, steady.transpose(2, 0, 1), atol=0.6, rtol=0) or not bright.all()
 
 
 def test_downscaling_averages_and_scales_the_camera(video: Path) -> None:
