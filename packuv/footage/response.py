@@ -87,7 +87,7 @@ def corner_radius(pinhole: PinholeCamera) -> float:
 
 
 def shading_means(pinhole: PinholeCamera) -> tuple[float, float]:
-    """Means m2, m4 of r^2 and r^4 over the picture: k1 (r^2 - m2) + k2 (r^4 - m4), the shading's logarithm, has mean 0."""
+    """Means m2, m4 of r^2 and r^4 over the picture; k1 (r^2 - m2) + k2 (r^4 - m4), the shading's log, has mean 0."""
     x, y = (pinhole.width / (2 * pinhole.fx)) ** 2, (pinhole.height / (2 * pinhole.fy)) ** 2
     return 1 / 3, (x * x / 5 + y * y / 5 + 2 * x * y / 9) / (x + y) ** 2
 
