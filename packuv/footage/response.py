@@ -70,7 +70,7 @@ class Response:
         """
         return self._applied(_carry, gradient)
 
-    def _applied(self, how, picture: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]  # a numba kernel
+    def _applied(self, how, picture: np.ndarray) -> np.ndarray:
         prefer_tbb()
         out = np.empty_like(picture)
         how(picture, np.array(self.factors, _f32), np.array((*self.falloff, *self.grid), _f32), out)
