@@ -26,7 +26,7 @@ from bench import command
 from packuv.camera import PinholeCamera
 from packuv.fit.density import DensityOptions
 from packuv.fit.frames import fit_segment
-from packuv.fit.keyframe import KeyState, choose_quantizer, fit_first, fit_next
+from packuv.fit.keyframe import choose_quantizer, fit_backdrop, fit_next
 from packuv.fit.model import Model
 from packuv.fit.options import FitOptions
 from packuv.fit.seam import tail
@@ -37,7 +37,7 @@ from packuv.fit.start.first import StartOptions, round_gaussians
 from packuv.footage import LensCamera, Views
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians
 from packuv.metrics import psnr
-from packuv.motion import MotionCache, MotionOptions, Still, changed_between, find_background, measure_motion
+from packuv.motion import MotionCache, MotionOptions, find_background, measure_motion
 from packuv.raster import RasterOptions, render
 
 WIDTH, HEIGHT = 96, 64
@@ -257,23 +257,22 @@ def fit_sequence(
 ) -> dict[str, list[Any]]:
     """Fit all segments; per frame the PSNR of the codes on the judges' cameras, dB; per segment count and memory.
 
-    Each segment starts at a keyframe of its own, as in the pipeline.
+    Each segment starts at a keyframe of its own, as in the pipeline: side by side all from the backdrop.
     """
     started = time.monotonic()
     stills = find_background(views, options.fit.background)
-    key = end = fit_first(views, 0, points=None, stills=stills, motion=MOTION, options=options.fit)
+    backdrop = end = fit_backdrop(views, stills, points=None, options=options.fit)
     found: dict[str, list[Any]] = {"psnr_db": [], "gaussians": [], "changed": [], "memory_mb": []}
     starts = range(0, len(views), options.segment)
-    for number, start in enumerate(starts):
+    for start in starts:
         if time.monotonic() - started > options.seconds:
             break
-        if number:
-            key = _next_key(end, views, start, stills, options.fit)
+        key = fit_next(end, views, start, stills=stills, motion=MOTION, options=options.fit)
         folder = scratch / f"segment{start}"
         folder.mkdir()
         instants = range(start, min(start + options.segment, len(views)))
         segment, _ = fit_segment(key, views, instants, motion=motion, options=options.fit, scratch=folder)
-        end = key if options.side_by_side else tail(key, segment)
+        end = backdrop if options.side_by_side else tail(key, segment)
         for index, instant in enumerate(instants):
             shown = key.quantizer.decode(segment.frame(index))
             found["psnr_db"].append(_score(shown, instant, judges, key.bounds))
@@ -281,11 +280,6 @@ def fit_sequence(
         found["changed"].append(int(segment.dynamic.sum()))
         found["memory_mb"].append(round(own_memory_mb(), 1))
     return found
-
-
-def _next_key(key: KeyState, views: Views, instant: int, stills: Sequence[Still], options: FitOptions) -> KeyState:
-    masks = [changed_between(views, camera, key.instant, instant, MOTION) for camera in range(len(views.cameras))]
-    return fit_next(key, views, instant, masks=masks, stills=stills, motion=MOTION, options=options)
 
 
 def _score(gaussians: Gaussians, instant: int, judges: Sequence[PinholeCamera], bounds: Bounds) -> float:

@@ -19,7 +19,6 @@ from packuv.footage.lens import LensCamera
 from packuv.footage.reader import FrameReader
 from packuv.footage.views import Views
 from packuv.interchange import write_ply
-from packuv.motion.step import MotionOptions
 from packuv.raster import RasterOptions, render
 
 
@@ -46,5 +45,5 @@ if __name__ == "__main__":
     nowhere, lenses = dict.fromkeys(CAMERAS, Path()), [LensCamera(camera) for camera in CAMERAS.values()]
     views = Views(nowhere, np.zeros((1, len(lenses)), int), lenses, reader=Arrays(nowhere))
     options = FitOptions(iterations=400, start=StartOptions(count=2000), shell=ShellOptions(enabled=False))
-    key = fit_first(views, 0, points=None, stills=[], motion=MotionOptions(), options=options)
+    key = fit_first(views, 0, points=None, options=options)
     print(f"{write_ply(Path(sys.argv[1]), key.gaussians)} Gaussians; {dict(key.figures)}")

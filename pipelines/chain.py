@@ -15,11 +15,13 @@ from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.fitting import (
     CutSegment,
+    FitBackdrop,
     FitFirst,
     FitNext,
     FitSegment,
     MeasureSeam,
     count_pictures,
+    has_backdrop,
     read_losses,
     read_seam,
 )
@@ -68,31 +70,45 @@ class Chain:
     def fit(self, spans: Sequence[range]) -> Iterator[tuple[Key, Key]]:
         """A keyframe and its segment for each span in order, and for each piece that a promoted keyframe cuts off.
 
-        Side by side, keyframes are fitted one from another, and the next one is submitted before the segment, because
-        the chain is the longest way through the work. One at a time, what comes after the anchor goes on from the end
-        of the segment before it, which costs less and shows no border.
+        Side by side, all keyframes start from the backdrop, and none waits for another. One at a time, all but the
+        first go on from the end of the segment before, which costs less and shows no border.
         """
-        instants = [span.start for span in spans]
         numbered = [Span(number, span) for number, span in enumerate(spans, start=1)]
-        anchor, steps = fitting_order(count_pictures(self.workshop, self.plan, self.take.groups, instants))
-        keys, segments = {anchor: self._first(instants[anchor]).result()}, {}
-        last = anchor
-        for index, start in steps:
-            if index > start and not self.plan.side_by_side:
-                continue
-            following = self._next(keys[start], (instants[start], instants[index]))
-            segments[last] = self._segment(keys[last], numbered[last])
-            keys[index], last = following.result(), index
-        segments[last] = self._segment(keys[last], numbered[last])
+        pieces = self._pieces(numbered)
         before: Piece | None = None
         for index, span in enumerate(numbered):
-            own = (keys[index], segments[index], span) if index in keys else None
+            own = pieces.get(index)
             if before and (own is None or self._shows(before, own)):
                 own = self._continue(before, span)
-            assert own is not None, "the first span has a keyframe, for the chain reaches back to it"
+            assert own is not None, "the first span has a keyframe of its own"
             for piece in self._promote(*own):
                 before = piece
                 yield piece[0], piece[1].result()
+
+    def _pieces(self, spans: Sequence[Span]) -> dict[int, Piece]:
+        """Those whose keyframe goes on from no segment, by place: the first, and side by side all of them."""
+        alone = range(len(spans) if self.plan.side_by_side else 1)
+        pictures = count_pictures(self.workshop, self.plan, self.take.groups, [span.instants.start for span in spans])
+        if not (self.background and has_backdrop(self.workshop, self.background, max(pictures))):
+            return dict(self._linked(spans, alone, *fitting_order(pictures)))
+        fit = self.options.fit.part(FirstOptions)
+        backdrop = self.submit(FitBackdrop(take=self.take, background=self.background, options=fit)).result()
+        keys = [self._next(backdrop, spans[index].instants.start) for index in alone]
+        return {index: self._piece(key.result(), spans[index]) for index, key in zip(alone, keys, strict=True)}
+
+    def _linked(
+        self, spans: Sequence[Span], alone: range, anchor: int, steps: Sequence[tuple[int, int]]
+    ) -> Iterator[tuple[int, Piece]]:
+        """Without a backdrop keyframes are fitted one from another; the next one is submitted before the segment,
+        because this chain is the longest way through the work."""
+        keys, last = {anchor: self._first(spans[anchor].instants.start).result()}, anchor
+        for index, start in steps:
+            if index > start and index not in alone:
+                continue
+            following = self._next(keys[start], spans[index].instants.start)
+            yield last, self._piece(keys[last], spans[last])
+            keys[index], last = following.result(), index
+        yield last, self._piece(keys[last], spans[last])
 
     def _promote(self, key: Key, segment: Future, span: Span) -> Iterator[Piece]:
         """The segment, cut where the fit of a frame shows that a keyframe is missing."""
@@ -116,26 +132,24 @@ class Chain:
 
     def _continue(self, before: Piece, span: Span) -> Piece:
         """A segment that goes on from the end of the one before it."""
-        key, segment, earlier = before
-        step = (earlier.instants.stop - 1, span.instants.start)
-        again = self._next(key, step, segment.result()).result()
-        return again, self._segment(again, span), span
+        key, segment, _ = before
+        return self._piece(self._next(key, span.instants.start, segment.result()).result(), span)
+
+    def _piece(self, key: Key, span: Span) -> Piece:
+        return key, self._segment(key, span), span
 
     def _first(self, instant: int) -> Future:
         fit = self.options.fit.part(FirstOptions)
-        motion = self.options.motion
-        return self.submit(
-            FitFirst(take=self.take, background=self.background, instant=instant, motion=motion, options=fit)
-        )
+        return self.submit(FitFirst(take=self.take, instant=instant, options=fit))
 
-    def _next(self, key: Key, step: tuple[int, int], end: Key | None = None) -> Future:
+    def _next(self, key: Key, instant: int, end: Key | None = None) -> Future:
         return self.submit(
             FitNext(
                 take=self.take,
                 background=self.background,
                 previous=key,
                 end=end,
-                step=step,
+                instant=instant,
                 motion=self.options.motion,
                 options=self.options.fit.part(NextOptions),
             )

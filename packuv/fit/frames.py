@@ -50,7 +50,7 @@ def fit_segment(
         track.add(_fit_frame(track.model, key, views, instant, masks, optical_flows, options))
         track.checkpoint()
         ticks.advance()
-    return track.segment(), track.figures
+    return track.segment(instants.start), track.figures
 
 
 def _fit_frame(
@@ -71,9 +71,11 @@ def _fit_frame(
     solver = Solver(model, key.bounds, options, rng)
     solver.fix(key.quantizer)
     rows = moving_rows(model.gaussians, key.quantizer, views, masks, key.bounds, options)
+    rows[: key.backdrop] = False
     model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, optical_flows, masks,
                                                near=key.bounds.near, options=options.lift)  # fmt: skip
     spare = opacity(model.gaussians) <= options.density.min_opacity
+    spare[: key.backdrop] = False
     model.forget_moments(np.flatnonzero(rows | spare))
     solver.free(rows | spare)
     shots = tiled(find_shots(views, instant, masks), masks, solver, views)
@@ -130,8 +132,8 @@ class Track:
         save_json(self._scratch / "track.json", {"figures": self.figures})
         (self._scratch / f"state_{count - 1:06d}.npz").unlink(missing_ok=True)
 
-    def segment(self) -> Segment:
-        """The codes of all frames; rows that are never visible are left out."""
+    def segment(self, first: int) -> Segment:
+        """The codes of all frames from instant `first` on; rows that are never visible are left out."""
         ever = self._first.attributes[:, OPACITY] > DEAD_CODE
         for codes in self.frames:
             ever |= codes.attributes[:, OPACITY] > DEAD_CODE
@@ -144,7 +146,7 @@ class Track:
         )
         attributes = (np.stack([c.attributes[dynamic] for c in self.frames])
                       if self.frames else np.empty((0, dynamic.sum(), width), np.uint8))  # fmt: skip
-        return Segment(self._key.instant, self._first[ever], dynamic[ever], xyz, attributes)
+        return Segment(first, self._first[ever], dynamic[ever], xyz, attributes)
 
     def _load(self, figures: list[dict[str, Any]]) -> None:
         count = len(figures)

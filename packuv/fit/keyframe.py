@@ -1,10 +1,13 @@
-"""Fit keyframes to the pictures of many cameras (paper §4.2); `packuv.fit.frames` fits the frames between them.
+"""Fit the backdrop and keyframes to the pictures of many cameras (paper §4.2); `packuv.fit.frames` fits the frames
+between them.
 
-    fit_first     pictures of one instant -> the first keyframe, and the quantizer of the whole sequence
-    fit_next      a keyframe and the pictures of another's instant -> that one; what did not change keeps its codes
+    fit_backdrop  what stands still in each camera -> Gaussians that no later fit touches
+    fit_first     pictures of one instant -> a keyframe without a backdrop, where too little is known to stand still
+    fit_next      the backdrop, or a keyframe, and the pictures of an instant -> its keyframe
 
-From the moment the quantizer is fixed every iteration renders decoded codes and the gradient passes straight through
-to float32 masters (low-precision optimisation), so the codes that are stored are the ones that were fitted.
+The first of them also fixes the quantizer of the whole sequence. From then on every iteration renders decoded codes and
+the gradient passes straight through to float32 masters (low-precision optimisation), so the codes that are stored are
+the ones that were fitted.
 """
 
 from __future__ import annotations
@@ -30,24 +33,29 @@ from packuv.fit.start.hull import hull_points, in_hull
 from packuv.fit.start.points import Points, drawn, no_points
 from packuv.fit.start.shell import Shell, sweep_shell
 from packuv.footage import Views, as_planes
-from packuv.gaussians.codes import OPACITY_RANGE, Quantizer, attribute_values
-from packuv.gaussians.floats import ATTRIBUTES, Gaussians, with_canonical_axes
+from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Quantizer, attribute_values
+from packuv.gaussians.floats import ATTRIBUTES, Gaussians, rows_of, with_canonical_axes
 from packuv.motion import Still
-from packuv.motion.step import MotionOptions, difference
+from packuv.motion.step import MotionOptions, changed_between, difference
 from packuv.progress import Progress, Ticks, no_progress
 from packuv.raster import Arena, RasterOptions, render
 
+LEAST_KNOWN = 0.5
+"""Share of the pictures that must be known to stand still for a backdrop"""
 DEAD_CODE = 1
 """Opacity codes up to this one decode below 1/255, which no renderer draws"""
 
 
 @dataclass(frozen=True)
 class KeyState:
-    """A fitted keyframe, from which segments and the next keyframe start."""
+    """The backdrop or a fitted keyframe, from which segments and the next keyframe start."""
 
-    instant: int
+    instant: int | None
+    """None of the backdrop alone"""
     gaussians: Gaussians
     """float32 masters, not rounded to codes"""
+    backdrop: int
+    """How many of the first rows are the backdrop's: the same in every keyframe and frame, to the bit"""
     quantizer: Quantizer
     bounds: Bounds
     figures: Mapping[str, Any]
@@ -57,8 +65,8 @@ class KeyState:
         """Write state.npz and key.json."""
         save_npz(folder / "state.npz", {name: getattr(self.gaussians, name) for name in ATTRIBUTES})
         bounds = {"centre": self.bounds.centre.tolist(), "radius": self.bounds.radius, "near": self.bounds.near}
-        save_json(folder / "key.json", {"instant": self.instant, "quantizer": self.quantizer.to_json(),
-                                         "bounds": bounds, "figures": dict(self.figures)})  # fmt: skip
+        facts = {"instant": self.instant, "backdrop": self.backdrop, "quantizer": self.quantizer.to_json()}
+        save_json(folder / "key.json", {**facts, "bounds": bounds, "figures": dict(self.figures)})
 
     @classmethod
     def load(cls, folder: Path) -> KeyState:
@@ -66,58 +74,69 @@ class KeyState:
         bounds = Bounds(np.array(data["bounds"]["centre"]), data["bounds"]["radius"], data["bounds"]["near"])
         with np.load(folder / "state.npz") as arrays:
             gaussians = Gaussians(*(arrays[name] for name in ATTRIBUTES))
-        return cls(data["instant"], gaussians, Quantizer.from_json(data["quantizer"]), bounds, data["figures"])
+        quantizer = Quantizer.from_json(data["quantizer"])
+        return cls(data["instant"], gaussians, data["backdrop"], quantizer, bounds, data["figures"])
 
 
-def fit_first(
+def enough_stands_still(stills: int, known_share: float, pictures: int) -> bool:
+    """Whether all keyframes may build on a backdrop: so many cameras have a background, of which this mean share of the
+    pixels is known, and so many film at once."""
+    return stills >= max(2, pictures) and known_share >= LEAST_KNOWN
+
+
+def fit_backdrop(
     views: Views,
-    instant: int,
+    stills: Sequence[Still],
     *,
     points: Points | None,
-    stills: Sequence[Still],
-    motion: MotionOptions,
     options: FirstOptions,
     progress: Progress = no_progress,
 ) -> KeyState:
-    """Fit the first keyframe from sparse points, the shell around the scene and random Gaussians: the background of
-    the sequence first, then what stands before it.
+    """Fit what stands still, from sparse points, the shell around the scene and random Gaussians.
 
-    `views` must hold the cameras to fit and no others; `stills` are their backgrounds, or empty. Raises ValueError if
-    fewer than two have a picture.
+    `views` must hold the cameras to fit and no others. Raises ValueError for fewer than two stills.
     """
+    if len(stills) < 2:
+        raise ValueError(f"a backdrop needs what stands still in two cameras, but is given {len(stills)}")
+    shots = [_still_shot(views, still) for still in stills]
+    room = replace(options.density, cap=round(options.backdrop_share * options.density.cap))
+    state = _fit_all(views, shots, None, points, replace(options, density=room), progress)
+    drawn = state.quantizer.encode(state.gaussians).attributes[:, OPACITY] > DEAD_CODE
+    return replace(state, gaussians=rows_of(state.gaussians, drawn), backdrop=int(drawn.sum()))
+
+
+def fit_first(
+    views: Views, instant: int, *, points: Points | None, options: FirstOptions, progress: Progress = no_progress
+) -> KeyState:
+    """Fit all that the pictures of an instant show, as `fit_backdrop` does. Raises ValueError for fewer than two."""
+    return _fit_all(views, find_shots(views, instant), instant, points, options, progress)
+
+
+def _fit_all(
+    views: Views,
+    shots: Sequence[Shot],
+    instant: int | None,
+    points: Points | None,
+    options: FirstOptions,
+    progress: Progress,
+) -> KeyState:
     started = time.monotonic()
-    shots = find_shots(views, instant)
-    still_shots = [_still_shot(views, still) for still in stills]
-    with_background = len(still_shots) >= len(shots)
-    first = still_shots if with_background else shots
     bounds = find_bounds(views.cameras, near_share=options.near_share)
-    rng = np.random.default_rng([options.seed, instant, 0])
-    cameras, targets = [shot.camera for shot in first], [shot.response.undone(shot.target) for shot in first]
+    rng = np.random.default_rng([options.seed, 0 if instant is None else instant, 0])
+    cameras, targets = [shot.camera for shot in shots], [shot.response.undone(shot.target) for shot in shots]
     shell = sweep_shell(cameras, targets, bounds=bounds, options=options.shell) if options.shell.enabled else None
     start = first_gaussians(cameras, targets, bounds=bounds, surface=_surface(shell, points, options),
                             options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
     model = Model(start)
     solver = Solver(model, bounds, options, rng)
-    total = options.iterations
+    total, grow_from = options.iterations, options.start.count
     ticks = Ticks(progress, total)
     coarse, floating = round(total * options.coarse_share), round(total * options.float_share)
-    solver.run([halved(shot) for shot in first], coarse, of=total, grow_from=options.start.count, ticks=ticks)
+    solver.run([halved(shot) for shot in shots], coarse, of=total, grow_from=grow_from, ticks=ticks)
     if shell is not None:
         depths = (shell.depths(camera, index, bounds.near) for index, camera in enumerate(cameras))
-        first = [replace(shot, depths=known) for shot, known in zip(first, depths, strict=True)]
-    if with_background:
-        solver.run(
-            first,
-            round(total * options.background.iteration_share) - coarse,
-            of=total,
-            grow_from=options.start.count,
-            ticks=ticks,
-        )
-        masks = _before_background(views, instant, stills, motion)
-        solver.append(_hull_gaussians(views, instant, masks, bounds, options, rng, options.sh_degree))
-    else:
-        shots = first
-    solver.run(shots, floating - solver.done, of=total, grow_from=options.start.count, ticks=ticks)
+        shots = [replace(shot, depths=known) for shot, known in zip(shots, depths, strict=True)]
+    solver.run(shots, floating - solver.done, of=total, grow_from=grow_from, ticks=ticks)
     solver.keep(solver.worth_keeping())
     model.gaussians = with_canonical_axes(model.gaussians)
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
@@ -125,7 +144,7 @@ def fit_first(
     model.limit_sh(degree)
     solver.fix(choose_quantizer(model.gaussians, bounds, degree))
     losses = solver.run(shots, total - floating, of=total, ticks=ticks)
-    return KeyState(instant, model.gaussians, solver.known_quantizer, bounds, _figures(started, losses, solver))
+    return KeyState(instant, model.gaussians, 0, solver.known_quantizer, bounds, _figures(started, losses, solver))
 
 
 def fit_next(
@@ -133,18 +152,17 @@ def fit_next(
     views: Views,
     instant: int,
     *,
-    masks: Sequence[np.ndarray | None],
     stills: Sequence[Still],
     motion: MotionOptions,
     options: NextOptions,
     progress: Progress = no_progress,
 ) -> KeyState:
-    """Fit a keyframe from a neighbouring one, later or earlier.
+    """Fit a keyframe from the backdrop, or from a neighbouring keyframe, later or earlier.
 
-    `masks` tell, per camera of `views`, what differs between the two instants, bool [H, W] (None: unknown, the whole
-    picture may). Gaussians that touch no mask keep every code. What stood before the background and has gone is
-    dropped, and new Gaussians are born in the hull of what stands there now; `stills` may be empty, then nothing is
-    known to have gone. What exceeds the cap makes room: of the Gaussians that may change, those that show least.
+    Only what differs from there may change: Gaussians that no difference touches keep every code, and those of the
+    backdrop keep it in any case. What stood before the background and has gone is dropped, and new Gaussians are born
+    in the hull of what stands there now; `stills` may be empty, then nothing is known to have gone. What exceeds the
+    cap makes room: of the Gaussians that may change, those that show least.
     """
     started = time.monotonic()
     bounds, quantizer = previous.bounds, previous.quantizer
@@ -152,22 +170,33 @@ def fit_next(
     model = Model(previous.gaussians)
     solver = Solver(model, bounds, options, rng)
     solver.fix(quantizer)
+    standing = _standing(views, instant, stills, motion)
+    masks = standing if previous.instant is None else _changes(views, previous.instant, instant, motion)
     shots = find_shots(views, instant, masks)
     if not shots:
-        return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, {}, solver))
-    before, after = (_before_background(views, i, stills, motion) for i in (previous.instant, instant))
-    gone = _inside(model.gaussians, views, before, bounds, options)
-    gone &= ~_inside(model.gaussians, views, after, bounds, options)
+        return replace(previous, instant=instant, figures=_figures(started, {}, solver))
+    gone = np.zeros(len(model), bool)
+    if previous.instant is not None:
+        before = _standing(views, previous.instant, stills, motion)
+        gone = _inside(model.gaussians, views, before, bounds, options)
+        gone &= ~_inside(model.gaussians, views, standing, bounds, options)
+        gone[: previous.backdrop] = False
     solver.keep(~gone)
-    solver.free(moving_rows(model.gaussians, quantizer, views, masks, bounds, options))
+    rows = moving_rows(model.gaussians, quantizer, views, masks, bounds, options)
+    rows[: previous.backdrop] = False
+    solver.free(rows)
     solver.make_room(shots)
-    seen = [mask if alone is None else alone for alone, mask in zip(after, masks, strict=True)]
+    seen = [mask if alone is None else alone for alone, mask in zip(standing, masks, strict=True)]
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
-    losses = solver.run(shots, options.key_iterations, of=options.key_iterations, grow_from=options.start.count,
+    losses = solver.run(shots, options.key_iterations, of=options.key_iterations, grow_from=len(model),
                       ticks=Ticks(progress, options.key_iterations))  # fmt: skip
     solver.keep(~solver.rows | solver.worth_keeping())
-    return KeyState(instant, model.gaussians, quantizer, bounds, _figures(started, losses, solver))
+    return KeyState(instant, model.gaussians, previous.backdrop, quantizer, bounds, _figures(started, losses, solver))
+
+
+def _changes(views: Views, first: int, last: int, motion: MotionOptions) -> list[np.ndarray | None]:
+    return [changed_between(views, camera, first, last, motion) for camera in range(len(views.cameras))]
 
 
 def _still_shot(views: Views, still: Still) -> Shot:
@@ -175,14 +204,14 @@ def _still_shot(views: Views, still: Still) -> Shot:
     return Shot(views.cameras[still.camera], as_planes(still.pixels), response, known=still.known)
 
 
-def _before_background(
-    views: Views, instant: int, stills: Sequence[Still], motion: MotionOptions
-) -> list[np.ndarray | None]:
-    """What each camera's picture shows that its background lacks, bool [H, W]; None without one of the two."""
+def _standing(views: Views, instant: int, stills: Sequence[Still], motion: MotionOptions) -> list[np.ndarray | None]:
+    """Where each camera's picture shows what its background lacks, or nobody knows that, bool [H, W]; None without
+    one of the two pictures."""
     masks: list[np.ndarray | None] = [None] * len(views.cameras)
     for still in stills:
         pixels = views.steady(still.camera, instant)
-        masks[still.camera] = None if pixels is None else difference(still.pixels, pixels, motion)
+        if pixels is not None:
+            masks[still.camera] = difference(still.pixels, pixels, motion) | ~still.known
     return masks
 
 
@@ -220,9 +249,10 @@ def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, o
 
     def loss(degree: int) -> float:
         cut = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
-        drawn = (render(cut, s.camera, options=raster, arena=arena).colour for s in shots)
-        values = [photometric_loss(shot.response.shown(picture), shot.target, options=options.photometric).value
-                  for picture, shot in zip(drawn, shots, strict=True)]  # fmt: skip
+        values = []
+        for shot in shots:
+            picture = shot.response.shown(render(cut, shot.camera, options=raster, arena=arena).colour)
+            values.append(photometric_loss(picture, shot.wanted(picture), options=options.photometric).value)
         return float(np.mean(values))
 
     if not full:

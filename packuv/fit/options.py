@@ -84,6 +84,8 @@ class FirstOptions(KeyframeOptions):
     """Share of the loss that the bands above a degree must gain to be carried"""
     near_share: float = 0.2
     """Near plane, in scene radii; cameras may sit in the wall they film"""
+    backdrop_share: float = 0.75
+    """Of the cap on Gaussians, at most, for what stands still"""
     background: BackgroundOptions = field(default_factory=BackgroundOptions)
     shell: ShellOptions = field(default_factory=ShellOptions)
 

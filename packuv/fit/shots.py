@@ -35,6 +35,10 @@ class Shot:
     depths: SparseDepth | None = None
     """Where the surface is known to be"""
 
+    def wanted(self, picture: np.ndarray) -> np.ndarray:
+        """The target, float32 [3, H, W]; what is not known is taken for right as `picture` shows it."""
+        return self.target if self.known is None else np.where(self.known, self.target, picture)
+
 
 def halved(shot: Shot) -> Shot:
     """The same picture at half its size."""

@@ -179,9 +179,10 @@ class Solver:
         behind = self._behind(shot.target) if opaque else None
         colour = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
         picture = shot.response.shown(colour)
-        # What is not known is taken for right as it is.
-        target = shot.target if shot.known is None else np.where(shot.known, shot.target, picture)
-        found = pulls(Seen(rendering, picture, target, shot, self.model.gaussians, moving, self.bounds.radius), options)
+        found = pulls(
+            Seen(rendering, picture, shot.wanted(picture), shot, self.model.gaussians, moving, self.bounds.radius),
+            options,
+        )
         drawn = self._carried_back(rendering, found, shot.response, behind)
         self.gradient.add(drawn.means2d, rendering.visible, shot.camera.width, shot.camera.height)
         values = {name: getattr(drawn, name) for name in ATTRIBUTES}

@@ -14,11 +14,10 @@ import numpy as np
 from calibration.triangulate import SparsePoints
 from packuv.files import save_json
 from packuv.fit.frames import fit_segment
-from packuv.fit.keyframe import KeyState, fit_first, fit_next
+from packuv.fit.keyframe import KeyState, enough_stands_still, fit_backdrop, fit_first, fit_next
 from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
 from packuv.fit.seam import seam, tail
 from packuv.fit.start.points import Points
-from packuv.footage import Views
 from packuv.gaussians.rows import hold_absent
 from packuv.gaussians.segment import Segment
 from packuv.motion import (
@@ -27,7 +26,6 @@ from packuv.motion import (
     MotionOptions,
     Plate,
     Still,
-    changed_between,
     compare_plate,
     find_background,
     load_stills,
@@ -101,14 +99,37 @@ class UsePlate(Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitFirst(Stage):
-    """Fit the keyframe that the chain starts with: state.npz and key.json, with the quantizer of all."""
+class FitBackdrop(Stage):
+    """Fit what stands still, from which all keyframes start: state.npz and key.json, with the quantizer of all."""
 
-    name, version = "key", 6
+    name, version = "backdrop", 1
     take: Take
-    background: Key | None
+    background: Key
+    options: FirstOptions
+
+    @property
+    def label(self) -> str:
+        return "fit backdrop"
+
+    def build(self, work: Work) -> Notes:
+        state = fit_backdrop(
+            Footage(self.take, work.site).open_views(),
+            _stills(work, self.background),
+            points=_points(work, self.take),
+            options=self.options,
+            progress=work.progress,
+        )
+        state.save(work.out)
+        return dict(state.figures)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitFirst(Stage):
+    """Fit the keyframe that a chain without backdrop starts with: state.npz and key.json, with the quantizer of all."""
+
+    name, version = "key", 7
+    take: Take
     instant: int
-    motion: MotionOptions
     options: FirstOptions
 
     @property
@@ -116,14 +137,10 @@ class FitFirst(Stage):
         return f"fit keyframe {self.instant}"
 
     def build(self, work: Work) -> Notes:
-        assert self.take.rig is not None, "points lie beside the rig"
-        points = work.path(self.take.rig) / POINTS
         state = fit_first(
             Footage(self.take, work.site).open_views(),
             self.instant,
-            points=_sure_points(SparsePoints.load(points)) if points.exists() else None,
-            stills=_stills(work, self.background),
-            motion=self.motion,
+            points=_points(work, self.take),
             options=self.options,
             progress=work.progress,
         )
@@ -133,33 +150,31 @@ class FitFirst(Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class FitNext(Stage):
-    """Fit a keyframe from another one, or from the last frame of that one's segment: state.npz and key.json."""
+    """Fit a keyframe from the backdrop, another keyframe, or the last frame of that one's segment: state.npz and
+    key.json."""
 
-    name, version = "key", 6
+    name, version = "key", 7
     take: Take
     background: Key | None
     previous: Key
     end: Key | None
     """Segment of `previous` from whose last frame to go on"""
-    step: tuple[int, int]
-    """Instants: from, to"""
+    instant: int
     motion: MotionOptions
     options: NextOptions
 
     @property
     def label(self) -> str:
-        return f"fit keyframe {self.step[1]}{f' after {self.step[0]}' if self.end else ''}"
+        return f"fit keyframe {self.instant}{f' after {self.instant - 1}' if self.end else ''}"
 
     def build(self, work: Work) -> Notes:
-        views, before = Footage(self.take, work.site).open_views(), KeyState.load(work.path(self.previous))
+        before = KeyState.load(work.path(self.previous))
         if self.end:
             before = tail(before, Segment.load(work.path(self.end) / SEGMENT))
-        instant = self.step[1]
         state = fit_next(
             before,
-            views,
-            instant,
-            masks=_changes(views, before.instant, instant, self.motion),
+            Footage(self.take, work.site).open_views(),
+            self.instant,
             stills=_stills(work, self.background),
             motion=self.motion,
             options=self.options,
@@ -248,6 +263,12 @@ def background_of(workshop: Workshop, take: Take, options: BackgroundOptions) ->
     return UsePlate(take=take, plate=workshop.files(videos, "reading plate"), options=options)
 
 
+def has_backdrop(workshop: Workshop, background: Key, pictures: int) -> bool:
+    """Whether enough is known to stand still to build all keyframes on, where so many cameras film at once."""
+    notes = workshop.store.receipt(background).notes
+    return enough_stands_still(notes["cameras"], notes["known_share"], pictures)
+
+
 def count_pictures(workshop: Workshop, plan: Plan, groups: Key, instants: Sequence[int]) -> list[int]:
     """How many of the fitted cameras filmed each of the plan's instants."""
     found = FrameGroups.load(workshop.path(groups))
@@ -289,11 +310,12 @@ def _stills(work: Work, background: Key | None) -> list[Still]:
     return load_stills(work.path(background) / STILLS) if background else []
 
 
-def _sure_points(sparse: SparsePoints) -> Points:
+def _points(work: Work, take: Take) -> Points | None:
     """Where surfaces surely are; of what moved on since, a fit prunes the few points that it starts with."""
+    assert take.rig is not None, "points lie beside the rig"
+    path = work.path(take.rig) / POINTS
+    if not path.exists():
+        return None
+    sparse = SparsePoints.load(path)
     sure = sparse.views >= SURE_VIEWS
     return Points(sparse.xyz[sure], sparse.rgb[sure] / 255)
-
-
-def _changes(views: Views, first: int, last: int, options: MotionOptions) -> list[np.ndarray | None]:
-    return [changed_between(views, camera, first, last, options) for camera in range(len(views.cameras))]

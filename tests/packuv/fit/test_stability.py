@@ -22,7 +22,7 @@ from bench.stress_fit import (
     ring_cameras,
 )
 from packuv.fit.frames import fit_segment
-from packuv.fit.keyframe import fit_first
+from packuv.fit.keyframe import enough_stands_still, fit_backdrop, fit_first, fit_next
 from packuv.fit.labels import LabelOptions
 from packuv.fit.start.shell import ShellOptions
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians
@@ -117,7 +117,11 @@ def _filmed(factory, cameras, frames, **options):
 
 def _first(views):
     stills = find_background(views, OPTIONS.fit.background)
-    return fit_first(views, 0, points=None, stills=stills, motion=MOTION, options=OPTIONS.fit)
+    known = float(np.mean([still.known.mean() for still in stills] or [0]))
+    if not enough_stands_still(len(stills), known, int((views.frames[0] >= 0).sum())):
+        return fit_first(views, 0, points=None, options=OPTIONS.fit)
+    backdrop = fit_backdrop(views, stills, points=None, options=OPTIONS.fit)
+    return fit_next(backdrop, views, 0, stills=stills, motion=MOTION, options=OPTIONS.fit)
 
 
 @pytest.mark.parametrize("side_by_side", [False, True])
@@ -137,7 +141,7 @@ def test_twenty_frames_in_two_segments_do_not_drift(sequence, tmp_path, side_by_
 
 def test_everything_may_move(tmp_path_factory, cameras, tmp_path):
     views, motion = _filmed(tmp_path_factory, cameras, 3, scene=everything)
-    key = _first(views)
+    key = fit_first(views, 0, points=None, options=OPTIONS.fit)
     options = dataclasses.replace(OPTIONS.fit, labels=ENDLESS)
     segment, figures = fit_segment(key, views, range(3), motion=motion, options=options, scratch=tmp_path)
     assert segment.dynamic.mean() > 0.95

@@ -85,7 +85,7 @@ def take(site):
 @pytest.fixture
 def key(site):
     """The first keyframe."""
-    state = KeyState(0, QUANTIZER.decode(segments()[0].key), QUANTIZER, Bounds(np.zeros(3), 3.0, 0.1), {})
+    state = KeyState(0, QUANTIZER.decode(segments()[0].key), 0, QUANTIZER, Bounds(np.zeros(3), 3.0, 0.1), {})
     return put(site, "key", state.save)
 
 
