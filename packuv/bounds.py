@@ -26,12 +26,16 @@ MOST_GAUSSIANS = 2**26
 MOST_CAMERAS = 10_000
 MOST_FRAMES = 2**18
 """Of a scene, 2.4 hours at 30 a second; their part of the header stays below MOST_JSON_BYTES"""
+MOST_LIT_FRAMES = 216_000
+"""Of a scene whose light changes, 2 hours at 30 a second: three numbers more for each"""
 MOST_REFERENCES = 64
 """Keys that are decoded for one key"""
 MOST_NUMBER = 1e30
 """Absolute value of a length, a coordinate or a code's value; float32 ends at 3e38"""
 MOST_NS = 4 * 10**18
 """Absolute value of a time, ns; differences of two still fit int64"""
+MOST_LIGHT = 10.0
+"""Absolute value of the natural logarithm of light: 22,000 times as much as in steady light, or as little"""
 MOST_RATE_PART = 2**31 - 1
 """Numerator and denominator of a frame rate: FFmpeg's"""
 MOST_TEXT = 1000
