@@ -18,6 +18,7 @@ import numpy as np
 
 from studio.clocks import EPOCH_NS, SECOND_NS, CameraTimes, ClockOptions, record, tick_times, timecode_lines
 from studio.film_set import FilmSet, build_set
+from studio.light import LightOptions, draw_shading, exposure_over_time, light_over_time
 from studio.raycast import cast, follow, look_once, render
 from studio.rig import PlacementOptions, StudioCamera, place_cameras
 from studio.srgb import srgb_from_linear
@@ -80,6 +81,7 @@ class SimulateOptions:
     rig: PlacementOptions = field(default_factory=PlacementOptions)
     clock: ClockOptions = field(default_factory=ClockOptions)
     colour: ColourOptions = field(default_factory=ColourOptions)
+    light: LightOptions = field(default_factory=LightOptions)
     entrance_share: float = 0.3
     """The door opens after this share of the capture, but after six seconds at the latest"""
     truth: TruthKind = TruthKind.FULL
@@ -179,25 +181,47 @@ def _write(
     digits = max(2, len(str(options.cameras)))
     names = [f"cam{number + 1:0{digits}d}" for number in range(options.cameras)]
     rig = place_cameras(names, options.width, options.height, options.seed, options.rig)
-    gains = draw_gains(options.cameras, options.seed, options.colour)
+    held_out = _held_out(names, options)
+    light = light_over_time(options.frames, options.light)
     entrance_s = min(options.entrance_share * float(options.frames / options.fps), LATEST_ENTRANCE_S)
     for part in ("videos", "timecodes", "truth"):
         (folder / part).mkdir()
-    _write_settings(folder / "capture.toml", names, options)
+    _write_settings(folder / "capture.toml", held_out, options)
     if options.calibration is CalibrationKind.GIVEN:
         _write_colmap(folder / "calibration", rig)
     for name, camera_times in zip(names, times, strict=True):
         (folder / "timecodes" / f"{name}.txt").write_text("\n".join(timecode_lines(camera_times)) + "\n")
     entrance_ns = EPOCH_NS + round(entrance_s * SECOND_NS)
-    recordings = [Recording(*parts) for parts in zip(rig, times, gains, strict=True)]
-    truth = truth_json(_plain(options), options.fps, tick_times(options.frames, options.fps), entrance_ns, recordings)
+    recordings = _recordings(rig, times, held_out, options)
+    ticks_ns = tick_times(options.frames, options.fps)
+    truth = truth_json(_plain(options), options.fps, ticks_ns, light, entrance_ns, recordings)
     (folder / "truth" / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
-    _film_all(folder, entrance_s, recordings, options, progress)
+    _film_all(folder, entrance_s, light, recordings, options, progress)
+
+
+def _held_out(names: Sequence[str], options: SimulateOptions) -> list[str]:
+    """Evenly spread over the rig, and never the first camera."""
+    count = options.held_out_count
+    return [names[(2 * place + 1) * options.cameras // (2 * count)] for place in range(count)]
+
+
+def _recordings(
+    rig: Sequence[StudioCamera], times: Sequence[CameraTimes], held_out: Sequence[str], options: SimulateOptions
+) -> list[Recording]:
+    gains = draw_gains(options.cameras, options.seed, options.colour)
+    shading = draw_shading(options.cameras, options.seed, options.light)
+    jumps = [camera for camera in rig if camera.name not in held_out][1]
+    exposures = [
+        exposure_over_time(t.ticks, options.frames // 2, options.light.exposure_jump if camera is jumps else 0.0)
+        for camera, t in zip(rig, times, strict=True)
+    ]
+    return [Recording(*parts) for parts in zip(rig, times, gains, exposures, shading, strict=True)]
 
 
 def _film_all(
     folder: Path,
     entrance_s: float,
+    light: np.ndarray,  # float64 [T, 3]
     recordings: Sequence[Recording],
     options: SimulateOptions,
     progress: Callable[[int, int], None] | None,
@@ -205,16 +229,25 @@ def _film_all(
     report = progress or (lambda done, total: None)
     done, total = 0, sum(len(recording.times.ticks) for recording in recordings)
     report(done, total)
-    film_set = build_set(options.seed, entrance_s)
+    film_set = build_set(options.seed, entrance_s, shine=options.light.shine, wall_lamps=options.light.wall_lamps)
     for recording in recordings:
-        for _ in _film(folder, film_set, recording, options):
+        for _ in film(folder, film_set, light, recording, options):
             done += 1
             report(done, total)
 
 
-def _film(folder: Path, film_set: FilmSet, recording: Recording, options: SimulateOptions) -> Iterator[None]:
-    """Film one camera's frames, yielding after each."""
-    camera, times, gains = recording
+def film(
+    folder: Path,
+    film_set: FilmSet,
+    light: np.ndarray,  # float64 [T, 3]
+    recording: Recording,
+    options: SimulateOptions,
+) -> Iterator[np.ndarray]:
+    """Write one camera's video, and its truth if that is full, into a capture folder; yields each picture as it is
+    written, uint8 [H, W, 3], sRGB."""
+    camera, times, gains, exposure, shading = recording
+    by_frame = gains * light[times.ticks] * exposure[:, None]  # [F, 3]
+    by_pixel = shading.factors(camera)[:, :, None]  # [H, W, 1]
     view = camera.view
     backdrop = look_once(view, film_set.standing, film_set.light, film_set.colours, samples=options.samples)
     with ExitStack() as stack:
@@ -227,33 +260,35 @@ def _film(folder: Path, film_set: FilmSet, recording: Recording, options: Simula
                 PixelTruthWriter(folder / "truth" / f"{camera.name}.npz", backdrop.centre_depth)
             )
         moment = film_set.at(_seconds(times.times_ns[0]))
-        for next_ns in times.next_times_ns:
-            light = render(
+        for factors, next_ns in zip(by_frame, times.next_times_ns, strict=True):
+            rig_light = render(
                 view, backdrop, film_set.standing, moment.movers, moment.blockers, film_set.light, film_set.colours
             )
-            video.write(srgb_picture(light, gains))
+            picture = srgb_picture(rig_light, factors * by_pixel)
+            video.write(picture)
             later = film_set.at(_seconds(next_ns))
             if truth is not None:
                 hits = cast(view, backdrop, moment.movers)
                 truth.write(hits, follow(view, hits, film_set.standing, moment.movers, later.movers))
             moment = later
-            yield
+            yield picture
 
 
 def _seconds(time_ns: np.int64) -> float:
     return int(time_ns - EPOCH_NS) / SECOND_NS
 
 
-def srgb_picture(light: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """What a camera records of linear light: gains, clipping at 1, sRGB, float32 [H, W, 3] to uint8 [H, W, 3]."""
-    return (255 * srgb_from_linear(np.clip(light * gains, 0, 1)) + 0.5).astype(np.uint8)
+def srgb_picture(light: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """What a camera records of linear light: factors, clipping at 1, sRGB, float32 [H, W, 3] to uint8 [H, W, 3].
+
+    Args:
+        factors: for the whole picture, float64 [3], or by pixel, [H, W, 3].
+    """
+    return (255 * srgb_from_linear(np.clip(light * factors, 0, 1)) + 0.5).astype(np.uint8)
 
 
-def _write_settings(path: Path, names: list[str], options: SimulateOptions) -> None:
+def _write_settings(path: Path, held_out: list[str], options: SimulateOptions) -> None:
     fps = options.fps
-    # evenly spread over the rig, and never the first camera
-    count = options.held_out_count
-    held_out = [names[(2 * place + 1) * options.cameras // (2 * count)] for place in range(count)]
     lines = [
         "# Written by packuv simulate",
         f'name = "{options.name}"',

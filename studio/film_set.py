@@ -14,7 +14,18 @@ from functools import lru_cache
 import numpy as np
 
 from studio.figure import STRIDE_M, Clothes, Pose, add_figure
-from studio.furniture import DOOR_LEFT, DOOR_RIGHT, DOOR_TOP, HALF_X, HALF_Y, HEIGHT, LAMP, add_furniture, add_room
+from studio.furniture import (
+    DOOR_LEFT,
+    DOOR_RIGHT,
+    DOOR_TOP,
+    HALF_X,
+    HALF_Y,
+    HEIGHT,
+    LAMP,
+    add_furniture,
+    add_room,
+    add_wall_lamps,
+)
 from studio.geometry import Look, Parts, turn_about_z
 from studio.raycast import Light, Paints, Shapes, paints
 from studio.standing import VOXEL_M, clearance_of
@@ -68,13 +79,15 @@ class FilmSet:
 
 
 @lru_cache(maxsize=2)
-def build_set(seed: int, entrance_s: float) -> FilmSet:
-    """Paint and furnish the room; takes some seconds, and is remembered."""
+def build_set(seed: int, entrance_s: float, *, shine: float = 0.0, wall_lamps: float = 0.0) -> FilmSet:
+    """Paint and furnish the room; takes some seconds, and is remembered. `LightOptions` has shine and wall lamps."""
     textures = _textures(seed)
     parts = Parts(textures)
     owners = {name: OBJECTS.index(name) for name in STANDING}
-    add_room(parts, owners)
+    add_room(parts, owners, shine=shine)
     add_furniture(parts, owners, np.random.default_rng([seed, 2]))
+    if wall_lamps > 0:
+        add_wall_lamps(parts, owners["lamp"], wall_lamps)
     standing = parts.shapes()
     return FilmSet(entrance_s, standing, _light(standing), paints(textures), textures)
 

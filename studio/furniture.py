@@ -18,14 +18,16 @@ DOOR_LEFT, DOOR_RIGHT, DOOR_TOP = 0.55, 1.55, 2.08
 CORRIDOR_LEFT, CORRIDOR_RIGHT, CORRIDOR_END = 0.1, 2.6, 6.0
 LAMP = np.array([0.55, -0.35, 2.90])
 """Middle of the ceiling lamp's face"""
+WHITE_ALBEDO = 0.69
+"""Of the texture `white`, in linear light"""
 
 Point = tuple[float, float, float]
 
 
-def add_room(parts: Parts, owners: dict[str, int]) -> None:
-    """Walls, floor, ceiling, corridor, door frame, skirting, ceiling lamp."""
+def add_room(parts: Parts, owners: dict[str, int], *, shine: float) -> None:
+    """Walls, floor, ceiling, corridor, door frame, skirting, ceiling lamp. The floor's gloss is `shine`."""
     room, lamp = owners["room"], owners["lamp"]
-    _slab(parts, room, (-5, -4.6, -0.2), (5, 6.4, 0), Look("floor", (0.42, 0.42)))
+    _slab(parts, room, (-5, -4.6, -0.2), (5, 6.4, 0), Look("floor", (0.42, 0.42), gloss=shine, polished=shine > 0))
     _slab(parts, room, (-5, -4.6, HEIGHT), (5, 6.4, HEIGHT + 0.2), Look("ceiling", (0.42, 0.42)))
     _slab(parts, room, (-HALF_X - WALL, -4.2, 0), (-HALF_X, 4.2, HEIGHT), Look("plaster_warm", (0.45, 0.45)))
     _slab(parts, room, (HALF_X, -4.2, 0), (HALF_X + WALL, 4.2, HEIGHT), Look("plaster_blue", (0.45, 0.45)))
@@ -42,6 +44,16 @@ def add_room(parts: Parts, owners: dict[str, int]) -> None:
         for y in (-0.17, 0.17):
             low, high = (LAMP[0] + x - 0.14, LAMP[1] + y - 0.14, 2.905), (LAMP[0] + x + 0.14, LAMP[1] + y + 0.14, 2.92)
             _slab(parts, lamp, low, high, Look("white", emission=1.1))
+
+
+def add_wall_lamps(parts: Parts, lamp: int, radiance: float) -> None:
+    """A panel of light on each wall, between the pictures and low enough for cameras across the room; it lights only
+    itself."""
+    look, half_wide, half_deep = Look("white", emission=radiance / WHITE_ALBEDO), 0.15, 0.04
+    for x, y in ((-1.45, HALF_Y), (-2.42, -HALF_Y)):
+        parts.box(lamp, np.array([x, y, 1.4]), np.array([half_wide, half_deep, 0.55]), look)
+    for x, y in ((HALF_X, 1.22), (-HALF_X, 2.04)):
+        parts.box(lamp, np.array([x, y, 1.4]), np.array([half_deep, half_wide, 0.55]), look)
 
 
 def add_furniture(parts: Parts, owners: dict[str, int], rng: np.random.Generator) -> None:

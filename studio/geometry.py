@@ -7,7 +7,7 @@ what makes the optical flow exact. Lengths are metres, z is up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,8 @@ class Look:
     """Share of light mirrored at normal incidence"""
     emission: float = 0.0
     """Radiance of its own per unit of albedo"""
+    polished: bool = False
+    """What mirrors the lamp's light mirrors what stands in the room, too, and all the more the flatter it is seen"""
 
 
 class _Mesh(NamedTuple):
@@ -65,7 +67,7 @@ class Parts:
     ) -> None:
         """A board of which each of the two wide faces shows the texture once."""
         wide = [2 * side for axis, side in enumerate(half) if axis != int(np.argmin(half))]
-        fitted = Look(look.texture, (1 / wide[0], 1 / wide[1]), (0.5, 0.5), look.tint, look.gloss, look.emission)
+        fitted = replace(look, scale=(1 / wide[0], 1 / wide[1]), offset=(0.5, 0.5))
         self.box(owner, centre, half, fitted, turn)
 
     def ellipsoid(
@@ -130,7 +132,7 @@ class Parts:
                 np.int32
             ),
             np.concatenate([self._owners, np.repeat([mesh.owner for mesh in self._meshes], faces)]).astype(np.uint8),
-            np.array(self._looks, dtype=np.float64).reshape(-1, 11),
+            np.array(self._looks, dtype=np.float64).reshape(-1, 12),
             *tree_over(*item_bounds(kind, matrix, size, vertices, triangles)),
         )
 
@@ -146,7 +148,7 @@ class Parts:
 
     def _row(self, look: Look, density: float) -> tuple[float, ...]:
         texture = float(self._textures.index[look.texture])
-        return (texture, *look.scale, *look.offset, *look.tint, look.gloss, look.emission, density)
+        return (texture, *look.scale, *look.offset, *look.tint, look.gloss, look.emission, density, look.polished)
 
     def _texels(self, look: Look, along_u: float, along_v: float) -> float:
         """Texels per metre, the geometric mean of both directions; the lengths are metres for one unit of u and v."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -19,10 +19,11 @@ import numpy as np
 
 from studio.clocks import CameraTimes
 from studio.film_set import MOVING, OBJECTS
+from studio.light import LensShading
 from studio.raycast import Hits, Motion
 from studio.rig import StudioCamera
 
-VERSION = 1
+VERSION = 2
 MOVES, SEEN = 1, 2
 """Bits of the flags"""
 
@@ -34,6 +35,9 @@ class Recording(NamedTuple):
     times: CameraTimes
     gains: np.ndarray
     """float64 [3]: factors r g b on linear light that its exposure and white balance apply"""
+    exposure: np.ndarray
+    """float64 [frames]: factor on top by recorded frame"""
+    shading: LensShading
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +64,10 @@ class CameraTruth:
     times: CameraTimes
     gains: np.ndarray
     """float64 [3]: factors r g b on linear light that this camera's exposure and white balance applied"""
+    exposure: np.ndarray
+    """float64 [frames]: factor on top by recorded frame; geometric mean 1"""
+    shading: LensShading
+    """What the lens does to light over the picture"""
     path: Path
     """The npz file with the frames; it is missing if the capture was made with light truth"""
 
@@ -92,6 +100,8 @@ class Truth:
     fps: Fraction
     tick_times_ns: np.ndarray
     """int64 [T]: true times of the trigger's ticks"""
+    light: np.ndarray
+    """float64 [T, 3]: factors r g b of the lamps' light at the ticks, geometric mean 1 per channel"""
     entrance_ns: int
     """True time at which the door begins to open"""
     objects: tuple[str, ...]
@@ -117,6 +127,7 @@ def read_truth(capture: Path) -> Truth:
     return Truth(
         fps=Fraction(data["fps"]),
         tick_times_ns=np.array(data["tick_times_ns"], np.int64),
+        light=np.array(data["light"], np.float64),
         entrance_ns=data["entrance_ns"],
         objects=tuple(data["objects"]),
         movers=tuple(data["movers"]),
@@ -128,6 +139,7 @@ def truth_json(
     options: Mapping[str, Any],
     fps: Fraction,
     ticks_ns: np.ndarray,  # int64 [T]
+    light: np.ndarray,  # float64 [T, 3]
     entrance_ns: int,
     recordings: Sequence[Recording],
 ) -> dict[str, Any]:
@@ -137,10 +149,11 @@ def truth_json(
         "options": dict(options),
         "fps": f"{fps.numerator}/{fps.denominator}",
         "tick_times_ns": ticks_ns.tolist(),
+        "light": light.tolist(),
         "entrance_ns": entrance_ns,
         "objects": list(OBJECTS),
         "movers": list(MOVING),
-        "cameras": {recording.camera.name: _camera_to_json(*recording) for recording in recordings},
+        "cameras": {recording.camera.name: _camera_to_json(recording) for recording in recordings},
     }
 
 
@@ -195,11 +208,14 @@ _TIMES = ("ticks", "times_ns", "next_times_ns", "stamps_ns", "dropped")
 _CLOCK = ("first_index", "offset_ns", "drift_ppm", "phase_ns")
 
 
-def _camera_to_json(camera: StudioCamera, times: CameraTimes, gains: np.ndarray) -> dict[str, Any]:
+def _camera_to_json(recording: Recording) -> dict[str, Any]:
+    camera, times, gains, exposure, shading = recording
     return {
         **{name: getattr(camera, name) for name in _LENS},
         "camera_from_world": camera.camera_from_world.tolist(),
         "gains": gains.tolist(),
+        "shading": asdict(shading),
+        "exposure": exposure.tolist(),
         **{name: getattr(times, name).tolist() for name in _TIMES},
         **{name: getattr(times, name) for name in _CLOCK},
     }
@@ -210,4 +226,5 @@ def _camera_from_json(name: str, item: Mapping[str, Any], folder: Path) -> Camer
     arrays = {key: np.array(item[key], np.int64) for key in _TIMES}
     times = CameraTimes(**arrays, **{key: item[key] for key in _CLOCK})  # type: ignore[arg-type]  # from JSON
     camera = StudioCamera(name, **{key: item[key] for key in _LENS}, camera_from_world=pose)
-    return CameraTruth(camera, times, np.array(item["gains"], dtype=np.float64), folder / f"{name}.npz")
+    gains, exposure = (np.array(item[key], np.float64) for key in ("gains", "exposure"))
+    return CameraTruth(camera, times, gains, exposure, LensShading(**item["shading"]), folder / f"{name}.npz")

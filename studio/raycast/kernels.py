@@ -69,7 +69,7 @@ class Shapes(NamedTuple):
     owner: np.ndarray
     """uint8 [P + F]: object that the item belongs to"""
     looks: np.ndarray
-    """float64 [L, 11]: texture, scale u v, offset u v, tint r g b, gloss, emission, texels per metre"""
+    """float64 [L, 12]: texture, scale u v, offset u v, tint r g b, gloss, emission, texels per metre, polished"""
     lower: np.ndarray
     """float64 [N, 3]: bounds of the nodes"""
     upper: np.ndarray
@@ -117,7 +117,7 @@ class Backdrop(NamedTuple):
     normal: np.ndarray
     """float32 [H, W, S * S, 3], unit, facing the camera"""
     ambient: np.ndarray
-    """float32 [H, W, S * S, 3]: radiance but for the key light's"""
+    """float32 [H, W, S * S, 3]: radiance but for the key light's, with what a polished surface mirrors"""
     key: np.ndarray
     """float32 [H, W, S * S, 3]: radiance that the key light adds unless a mover shadows the point"""
     centre_depth: np.ndarray
@@ -563,6 +563,30 @@ def _appearance(view, shapes, light, colours, hit, px, py, pz, dx, dy, dz, lamp)
     return nx, ny, nz, _shade(light, looks[row, 8], looks[row, 9], paint, lamp, px, py, pz, nx, ny, nz, dx, dy, dz)
 
 
+@_kernel
+def _mirrored(view, standing, light, colours, hit, px, py, pz, dx, dy, dz, nx, ny, nz, lamp, stack, entries):
+    """Radiance of what stands still that a polished surface mirrors (Schlick's approximation), nothing elsewhere."""
+    row = standing.look[hit[1]]
+    if standing.looks[row, 11] == 0:
+        return BLACK, BLACK, BLACK
+    dx, dy, dz = _unit(dx, dy, dz)
+    cosine, gloss = -(nx * dx + ny * dy + nz * dz), standing.looks[row, 8]
+    share = gloss + (1 - gloss) * (1 - cosine) ** 5
+    dx, dy, dz = dx + 2 * cosine * nx, dy + 2 * cosine * ny, dz + 2 * cosine * nz
+    # starts a little off the surface, as rays to lamps do
+    px, py, pz = px + nx * 1e-4, py + ny * 1e-4, pz + nz * 1e-4
+    t, item, second, third = _first_hit(standing, px, py, pz, dx, dy, dz, NOWHERE, stack, entries, False)
+    if item < 0:
+        return BLACK, BLACK, BLACK
+    px, py, pz = px + t * dx, py + t * dy, pz + t * dz
+    there = (hit[0] + t, item, second, third)
+    nx, ny, nz, shade = _appearance(view, standing, light, colours, there, px, py, pz, dx, dy, dz, lamp)
+    r, g, b = shade[0], shade[1], shade[2]
+    if shade[4] > 0 and _lit(standing, light, lamp, px, py, pz, nx, ny, nz, stack, entries):
+        r, g, b = r + shade[3], g + shade[4], b + shade[5]
+    return share * r, share * g, share * b
+
+
 # Whole pictures. Rows run in parallel; each pixel's sum has a fixed order.
 
 
@@ -599,6 +623,10 @@ def _look_sample(view, standing, light, colours, samples, column, row, k, out, s
         nx, ny, nz, shade = _appearance(view, standing, light, colours, hit, px, py, pz, dx, dy, dz, lamp)
         if shade[4] > 0 and not _lit(standing, light, lamp, px, py, pz, nx, ny, nz, stack, entries):
             shade = (shade[0], shade[1], shade[2], BLACK, BLACK, BLACK)
+        r, g, b = _mirrored(
+            view, standing, light, colours, hit, px, py, pz, dx, dy, dz, nx, ny, nz, lamp, stack, entries
+        )
+        shade = (shade[0] + r, shade[1] + g, shade[2] + b, shade[3], shade[4], shade[5])
     _store(out.normal, row, column, k, nx, ny, nz)
     _store(out.ambient, row, column, k, shade[0], shade[1], shade[2])
     _store(out.key, row, column, k, shade[3], shade[4], shade[5])

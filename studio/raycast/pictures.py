@@ -41,7 +41,7 @@ def render(
     """A picture in linear light, float32 [H, W, 3], with the backdrop's samples per pixel.
 
     Shading: Lambert from the key light with shadows, ambient light with contact occlusion, and a mirror lobe on
-    glossy surfaces.
+    glossy surfaces. Polished ones mirror what stands still, but nothing that moves.
     """
     out = np.empty((view.height, view.width, 3), np.float32)
     fill_picture(view, backdrop, standing, movers, blockers, light, colours, out)
