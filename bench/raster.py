@@ -46,13 +46,14 @@ from packuv.raster import (
     bins,
     blend,
     cpu,
+    lists,
     gradients,
     render,
     tile_shape,
 )
 
 STAGES = (
-    (cpu, "project"),
+    (lists, "project"),
     (bins, "drawn"),
     (bins, "sort_by_depth"),
     (bins, "running_sum"),
