@@ -46,8 +46,8 @@ from packuv.raster import (
     bins,
     blend,
     cpu,
-    lists,
     gradients,
+    lists,
     render,
     tile_shape,
 )
@@ -61,6 +61,7 @@ STAGES = (
     (bins, "count_pairs"),
     (bins, "start_tiles"),
     (bins, "scatter_pairs"),
+    (blend, "fill"),
     (blend, "blend"),
     (blend, "blend_backward"),
     (cpu, "project_backward"),

@@ -191,20 +191,35 @@ def write_tile(state, tile_x, tile_y, width, height, background, colour, depth, 
 
 
 @kernel(inner=True)
-def fill_tile(tile_x, tile_y, width, height, background, colour, depth, alpha):
-    """Nothing but background."""
+def _fill_row(tile_x, tile_end, tile_y, width, height, background, colour, depth, alpha):
+    """Nothing but background from one tile to another of a row of tiles, line by line as memory likes it."""
+    plane = width * height
     for y in range(TILE * tile_y, min(TILE * tile_y + TILE, height)):
-        begin, end = y * width + TILE * tile_x, y * width + min(TILE * tile_x + TILE, width)
+        begin, end = y * width + TILE * tile_x, y * width + min(TILE * tile_end, width)
         for channel in range(3):
-            colour[begin + width * height * channel : end + width * height * channel] = background[channel]
+            colour[begin + plane * channel : end + plane * channel] = background[channel]
         depth[begin:end] = _f32(0)
         alpha[begin:end] = _f32(0)
 
 
 @kernel(parallel=True)
+def fill(shown, width, height, background, colour, depth, alpha):
+    """Background in all tiles but those `shown`, bool [tiles_y, tiles_x]; the pictures are flat."""
+    for y in prange(shown.shape[0]):
+        x = 0
+        while x < shown.shape[1]:
+            end = x
+            while end < shown.shape[1] and not shown[y, end]:
+                end += 1
+            if end > x:
+                _fill_row(x, end, y, width, height, background, colour, depth, alpha)
+            x = end + 1
+
+
+@kernel(parallel=True)
 def blend(sums, record, pairs, start, tiles_x, width, height, background, colour, depth, alpha, used_end, visited,
           weights, jobs):  # fmt: skip
-    """Draw every tile whose list is not empty, background elsewhere.
+    """Draw every tile whose list is not empty; the others are left to `fill`.
 
     `record` and the pictures are flat; `used_end` [tiles] receives the end of the part of each list that was used,
     `visited` [tiles] the number of blocks; `weights` [pairs] receives the sum of transmittance * alpha
@@ -217,7 +232,6 @@ def blend(sums, record, pairs, start, tiles_x, width, height, background, colour
             x, y = tile % tiles_x, tile // tiles_x
             if start[tile] == start[tile + 1]:
                 used_end[tile], visited[tile] = start[tile], 0
-                fill_tile(x, y, width, height, background, colour, depth, alpha)
                 continue
             open_tile(state, width - TILE * x, height - TILE * y)
             used_end[tile], visited[tile], _ = blend_tile(

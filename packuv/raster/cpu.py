@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -30,9 +31,7 @@ class _Merged:
     """The lists of what is drawn over a layer, merged with those of the layer."""
 
     layer: Layer
-    stream: np.ndarray  # float32 [E * 16]: a record per entry
     entries: np.ndarray  # uint32 [E, 3], as pairs; slots are those of what changes
-    moves: np.ndarray  # uint8 [E]: 1 for what changes, 0 for the layer
     jumps: np.ndarray  # int64 [C, 3]
     jump_end: np.ndarray  # int64 [tiles]
 
@@ -109,10 +108,11 @@ def forward(
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     sums, arena = sums or register_lanes(), arena or Arena()
     view = view_constants(camera, options.near, options.low_pass_px2)
-    active = checked_tiles(tiles, camera) if over is None else over.checked_tiles(tiles, view, camera)
-    if over is not None and weights:
-        raise ValueError("blending weights over a layer are not computed; render all Gaussians in one set")
-    lists = listed(gaussians, degree, view, active, camera.height, arena)
+    if over is None:
+        active = checked_tiles(tiles, camera)
+    else:
+        active = over.tiles_to_draw(tiles, weights, camera, options)
+    lists = listed(gaussians, degree, view, active, camera.height, arena, room=0 if over is None else len(over.pairs))
     used_end, visited = arena.take(active.size, np.int64), arena.take(active.size, np.int32)
     merged = None if over is None else _room_to_merge(over, lists, arena)
     kept = _Kept(gaussians, view, degree, sums, arena, lists, used_end, visited, merged)
@@ -147,7 +147,7 @@ def backward(
     partial, used = arena.take(pair_count * RECORD, np.float32), arena.take(pair_count, np.uint8)
     given = -(-width // TILE), width, height, *(picture.reshape(-1) for picture in pictures), *upstream
     if kept.merged is not None:
-        _blend_over_backward(kept, kept.merged, given, partial, used)
+        _blend_over_backward(kept, kept.merged, given, chosen, partial, used)
     else:
         walked = lists.record.reshape(-1), lists.pairs, lists.start, kept.used_end
         blend.blend_backward(kept.sums, *walked, *given, chosen, partial, used, jobs())
@@ -167,10 +167,16 @@ def _checked_rows(rows: np.ndarray, count: int) -> np.ndarray:
 
 def _flat(gradient: np.ndarray | None, picture: np.ndarray) -> np.ndarray:
     if gradient is None:
-        return np.zeros(picture.size, np.float32)
+        return _no_gradient(picture.size)
     if gradient.shape != picture.shape:
         raise ValueError(f"the gradient of a picture {picture.shape} must have its shape, but has {gradient.shape}")
     return np.ascontiguousarray(gradient, np.float32).reshape(-1)
+
+
+@lru_cache(maxsize=8)
+def _no_gradient(size: int) -> np.ndarray:
+    """Zeros for kernels, which only read them."""
+    return np.zeros(size, np.float32)
 
 
 def _pictures(camera: PinholeCamera, arena: Arena) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -188,9 +194,9 @@ def _blend(
     partial = take(len(lists.pairs) if weights else 0, np.float32)
     walked = lists.record.reshape(-1), lists.pairs, lists.start
     flat = [picture.reshape(-1) for picture in (colour, depth, alpha)]
-    out = kept.used_end, kept.visited, partial
-    size = tile_shape(camera)[1], camera.width, camera.height
-    blend.blend(kept.sums, *walked, *size, background, *flat, *out, jobs())
+    out, shape, size = (kept.used_end, kept.visited, partial), tile_shape(camera), (camera.width, camera.height)
+    blend.fill((np.diff(lists.start) > 0).reshape(shape), *size, background, *flat)
+    blend.blend(kept.sums, *walked, shape[1], *size, background, *flat, *out, jobs())
     if not weights:
         return colour, depth, alpha, None
     shares = take(len(kept.gaussians), np.float32)
@@ -200,11 +206,8 @@ def _blend(
 
 def _room_to_merge(layer: Layer, lists: Lists, arena: Arena) -> _Merged:
     """Room for the merged lists; what is not walked stays untouched."""
-    count, take = len(layer.pairs) + len(lists.pairs), arena.take
-    stream, entries, moves = take(count * RECORD, np.float32), take((count, 3), np.uint32), take(count, np.uint8)
-    return _Merged(
-        layer, stream, entries, moves, take((len(layer.reach), 3), np.int64), take(layer.active.size, np.int64)
-    )
+    entries = arena.take((len(layer.pairs) + len(lists.pairs), 3), np.uint32)
+    return _Merged(layer, entries, arena.take((len(layer.reach), 3), np.int64), arena.take(layer.active.size, np.int64))
 
 
 def _blend_over(
@@ -213,21 +216,24 @@ def _blend_over(
     """Colour, depth, alpha over a layer."""
     layer, lists, pictures = merged.layer, kept.lists, _pictures(camera, kept.arena)
     still = layer.record, layer.pairs, layer.start, layer.first, layer.reach, layer.checkpoints
-    moving = lists.record.reshape(-1), lists.pairs, lists.start, active.reshape(-1)
-    size = tile_shape(camera)[1], camera.width, camera.height
-    room = merged.stream, merged.entries, merged.moves, merged.jumps, merged.jump_end
+    shown = (active > 0) & (np.diff(lists.start) + np.diff(layer.start) > 0).reshape(active.shape)
+    moving = len(kept.gaussians), lists.record.reshape(-1), lists.pairs, lists.start, shown.reshape(-1)
+    size = camera.width, camera.height
+    room = merged.entries, merged.jumps, merged.jump_end
     flat = [picture.reshape(-1) for picture in pictures]
-    merge.blend_over(
-        kept.sums, *still, *moving, *size, background, *room, *flat, kept.used_end, kept.visited, jobs()
-    )
+    out = kept.used_end, kept.visited
+    blend.fill(shown, *size, background, *flat)
+    merge.blend_over(kept.sums, *still, *moving, active.shape[1], *size, background, *room, *flat, *out, jobs())
     return pictures
 
 
 def _blend_over_backward(
-    kept: _Kept, merged: _Merged, given: Sequence[Any], partial: np.ndarray, used: np.ndarray
+    kept: _Kept, merged: _Merged, given: Sequence[Any], chosen: np.ndarray, partial: np.ndarray, used: np.ndarray
 ) -> None:
     """Partial gradients of what was drawn over a layer."""
     layer, lists = merged.layer, kept.lists
-    walked = merged.stream, merged.entries, merged.moves, merged.jumps, merged.jump_end, kept.used_end
-    where = layer.start, layer.first, layer.checkpoints, lists.pairs, lists.start
+    rows = kept.arena.take(len(lists.record), np.uint8)
+    rows[: len(chosen)], rows[len(chosen) :] = chosen, 0
+    where = layer.start, layer.first, layer.checkpoints, lists.record.reshape(-1), lists.pairs, lists.start
+    walked = merged.entries, merged.jumps, merged.jump_end, kept.used_end, rows
     merge.blend_over_backward(kept.sums, *where, *walked, *given, partial, used, jobs())

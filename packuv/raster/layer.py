@@ -15,23 +15,19 @@ from packuv.raster import blend, merge
 from packuv.raster.arena import Arena
 from packuv.raster.bins import GAUSSIAN, SLOT
 from packuv.raster.lists import Lists, listed
-from packuv.raster.picture import RasterOptions, checked_tiles
-from packuv.raster.project import DEPTH, RECORD
-from packuv.raster.view import TILE, VIEW_NEAR, view_constants
+from packuv.raster.picture import Composed, RasterOptions, checked_tiles
+from packuv.raster.project import DEPTH
+from packuv.raster.view import TILE, view_constants
 
 
 @dataclass(frozen=True)
-class Layer:
+class Layer(Composed):
     """Gaussians as one camera sees them, blended as far as that can be done once: see `merge`.
 
-    Takes 64 bytes per Gaussian that shows, and of the active tiles 12 bytes per pair up to where a tile is opaque,
-    5 KiB per 16 of these pairs, and 5 KiB.
+    Takes 64 bytes per Gaussian that shows and, of the active tiles up to where they are opaque, 12 bytes per pair and
+    5 KiB per started run of 32 pairs.
     """
 
-    view: np.ndarray
-    """float64 [27], see `view`"""
-    active: np.ndarray
-    """uint8 [tiles_y, tiles_x]: where it can be drawn over"""
     record: np.ndarray
     """float32 [N * 16]"""
     pairs: np.ndarray
@@ -53,21 +49,6 @@ class Layer:
         values = (getattr(self, field.name) for field in fields(self))
         return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
-    def checked_tiles(self, tiles: np.ndarray | None, view: np.ndarray, camera: PinholeCamera) -> np.ndarray:
-        """Tiles to draw, uint8 [tiles_y, tiles_x]. Raises ValueError where layer and `view` do not fit together."""
-        if not np.array_equal(np.delete(view, VIEW_NEAR), np.delete(self.view, VIEW_NEAR)):
-            raise ValueError(
-                f"a layer is drawn over with the camera and the low-pass filter that it was composed with, "
-                f"but camera {camera.name!r} has others"
-            )
-        active = self.active if tiles is None else checked_tiles(tiles, camera)
-        if np.any(active > self.active):
-            raise ValueError(
-                f"the layer was composed for {self.active.sum()} tiles, which lack "
-                f"{np.sum(active > self.active)} of those to draw"
-            )
-        return active
-
 
 def compose(
     gaussians: Gaussians,
@@ -78,7 +59,7 @@ def compose(
     tiles: np.ndarray | None = None,
     sums: Lanes | None = None,
 ) -> Layer:
-    """Arguments as in `cpu.forward`. Costs about two pictures of these Gaussians."""
+    """Compose a layer of N Gaussians; arguments as in `cpu.forward`. Costs about two pictures of them."""
     prefer_tbb()
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     sums, arena, active = sums or register_lanes(), Arena(), checked_tiles(tiles, camera)
@@ -89,14 +70,12 @@ def compose(
     reach, checkpoints = np.zeros(first[-1], np.float32), np.empty(first[-1] * merge.CHECKPOINT, np.float32)
     reach[1:] = record[pairs[_run_ends(start, first) - 1, GAUSSIAN], DEPTH]
     record, columns = record.reshape(-1), active.shape[1]
-    merge.take_checkpoints(
-        sums, record, pairs, start, first, columns, camera.width, camera.height, checkpoints, jobs()
-    )
+    merge.take_checkpoints(sums, record, pairs, start, first, columns, camera.width, camera.height, checkpoints, jobs())
     return Layer(view, active, record, pairs, start, first, reach, checkpoints, lists.invalid_count)
 
 
 def jobs() -> int:
-    """Pieces of work of a loop over tiles: more than threads, since tiles differ in cost. Results do not depend on it."""
+    """Pieces of work of a loop over tiles, more than threads, since tiles differ in cost; no result depends on it."""
     return 8 * numba.get_num_threads()
 
 

@@ -24,7 +24,7 @@ class Lists:
     """N Gaussians as one camera draws them; a pair is a Gaussian in a tile whose pixels it reaches."""
 
     record: np.ndarray
-    """float32 [N, 16], see `project`; undefined where nothing is drawn"""
+    """float32 [N + room, 16], see `project`; undefined where nothing is drawn"""
     visible: np.ndarray
     """int32 [N]: pairs of each Gaussian"""
     first_pair: np.ndarray
@@ -38,11 +38,21 @@ class Lists:
 
 
 def listed(
-    gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, height: int, arena: Arena
+    gaussians: Gaussians,
+    degree: int,
+    view: np.ndarray,
+    active: np.ndarray,
+    height: int,
+    arena: Arena,
+    *,
+    room: int = 0,
 ) -> Lists:
-    """Project and list in the active tiles, uint8 [tiles_y, tiles_x]. Raises ValueError for arrays that do not fit."""
+    """Project and list in the active tiles, uint8 [tiles_y, tiles_x], with `room` for more records behind.
+
+    Raises ValueError for arrays that do not fit.
+    """
     _check(gaussians, degree)
-    record, box, cells, invalid = _project(gaussians, degree, view, active, arena)
+    record, box, cells, invalid = _project(gaussians, degree, view, active, arena, room)
     return Lists(record, *_bin(record, box, cells, active, height, arena), invalid)
 
 
@@ -67,13 +77,13 @@ def _check(gaussians: Gaussians, degree: int) -> None:
 
 
 def _project(
-    gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, arena: Arena
+    gaussians: Gaussians, degree: int, view: np.ndarray, active: np.ndarray, arena: Arena, room: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Records, boxes, tiles per box, and how many Gaussians are invalid."""
     count = len(gaussians)
     active_sum = np.zeros((active.shape[0] + 1, active.shape[1] + 1), np.int32)
     active_sum[1:, 1:] = active.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
-    record, box = arena.take((count, RECORD), np.float32), arena.take((count, 4), np.int32)
+    record, box = arena.take((count + room, RECORD), np.float32), arena.take((count, 4), np.int32)
     cells, invalid = arena.take(count, np.int32), np.empty(CHUNKS, np.int64)
     project(*arrays(gaussians), degree, view, active_sum, record, box, cells, invalid)
     return record, box, cells, int(invalid.sum())
