@@ -35,7 +35,7 @@ from packuv.fit.adam import AdamState, adam_step
 from packuv.fit.device import choose_device
 from packuv.fit.labels import LabelOptions, count_hits
 from packuv.fit.losses import PhotometricOptions, photometric_loss
-from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.floats import Gaussians, arrays, rows_of
 from packuv.interchange import read_ply
 from packuv.kernels.simd import fma, splat, sum_lanes
 from packuv.raster import (
@@ -45,14 +45,17 @@ from packuv.raster import (
     Rendering,
     bins,
     blend,
+    compose,
     cpu,
     gradients,
+    lists,
+    merge,
     render,
     tile_shape,
 )
 
 STAGES = (
-    (cpu, "project"),
+    (lists, "project"),
     (bins, "drawn"),
     (bins, "sort_by_depth"),
     (bins, "running_sum"),
@@ -60,11 +63,19 @@ STAGES = (
     (bins, "count_pairs"),
     (bins, "start_tiles"),
     (bins, "scatter_pairs"),
+    (blend, "fill"),
     (blend, "blend"),
     (blend, "blend_backward"),
     (cpu, "project_backward"),
 )
 """Kernels of a rendering and its gradients, in order"""
+LAYER_STAGES = (
+    *STAGES[: STAGES.index((blend, "blend"))],
+    (merge, "blend_over"),
+    (merge, "blend_over_backward"),
+    (cpu, "project_backward"),
+)
+"""The same over a layer"""
 FORWARD_FLOPS, BACKWARD_FLOPS = 34, 58
 """Floating-point operations per pixel and Gaussian in the loops over blocks; fused ones count two, comparisons none"""
 
@@ -85,6 +96,14 @@ class BenchOptions:
     """Repetitions of every measurement"""
     shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.1, 0.05)
     """Shares of active tiles, one rectangle each; the same share of rows may change"""
+    changing: int = 4_000
+    """Gaussians of two figures in the made-up room that are drawn over a layer of the others"""
+    layer_tiles: float = 0.34
+    """Share of active tiles then"""
+    changing: int = 4_000
+    """Gaussians of two figures in the made-up room that are drawn over a layer of the others"""
+    layer_tiles: float = 0.34
+    """Share of active tiles then"""
     seed: int = 0
 
 
@@ -105,6 +124,17 @@ def room(options: BenchOptions) -> Gaussians:
     logits = rng.normal(size=count) * 1.5 + 0.5
     arrays = (means, scales, rng.normal(size=(count, 4)), logits, coefficients)
     return Gaussians(*(np.ascontiguousarray(array[order], np.float32) for array in arrays))
+
+
+def with_figures(options: BenchOptions) -> tuple[Gaussians, Gaussians]:
+    """The room without some of its Gaussians, and these on the skins of two standing figures."""
+    rng, whole = np.random.default_rng(options.seed), room(options)
+    rows = np.sort(rng.choice(options.count, options.changing, replace=False))
+    skin = rng.normal(size=(options.changing, 3))
+    skin *= np.array([0.12, 0.4, 0.12]) / np.linalg.norm(skin, axis=1, keepdims=True)
+    places = np.array([[-0.3, 0.1, 0.1], [0.35, 0.1, -0.2]])
+    whole.means[rows] = skin + places[rng.integers(0, 2, options.changing)]
+    return rows_of(whole, np.delete(np.arange(options.count), rows)), rows_of(whole, rows)
 
 
 def room_camera(options: BenchOptions) -> PinholeCamera:
@@ -143,16 +173,16 @@ def summary(samples: Sequence[float]) -> dict[str, float]:
 
 
 @contextmanager
-def stage_times(clock: Clock) -> Iterator[dict[str, list[float]]]:
+def stage_times(clock: Clock, stages: Sequence[tuple[Any, str]] = STAGES) -> Iterator[dict[str, list[float]]]:
     """Times of every kernel that a rendering calls, by name."""
-    times: dict[str, list[float]] = {name: [] for _, name in STAGES}
-    kernels = [getattr(module, name) for module, name in STAGES]
-    for (module, name), kernel in zip(STAGES, kernels, strict=True):
+    times: dict[str, list[float]] = {name: [] for _, name in stages}
+    kernels = [getattr(module, name) for module, name in stages]
+    for (module, name), kernel in zip(stages, kernels, strict=True):
         setattr(module, name, partial(timed, clock, times[name], kernel))
     try:
         yield times
     finally:
-        for (module, name), kernel in zip(STAGES, kernels, strict=True):
+        for (module, name), kernel in zip(stages, kernels, strict=True):
             setattr(module, name, kernel)
 
 
@@ -269,6 +299,53 @@ def measure_shares(gaussians: Gaussians, camera: PinholeCamera, options: BenchOp
     return out
 
 
+def measure_layer(options: BenchOptions, threads: int) -> dict[str, Any]:
+    """A picture and its gradients of two figures over a layer, and of all Gaussians in one set, by turns."""
+    numba.set_num_threads(threads)
+    clock = time.process_time if threads == 1 else time.perf_counter
+    (still, changing), camera = with_figures(options), room_camera(options)
+    whole = Gaussians(*(np.concatenate(pair) for pair in zip(arrays(still), arrays(changing), strict=True)))
+    rows, tiles = np.arange(len(whole)) >= len(still), _rectangle(tile_shape(camera), options.layer_tiles)
+    given: dict[str, Any] = {"options": RasterOptions(near=0.05), "tiles": tiles}
+    slopes = np.random.default_rng(options.seed).normal(size=(3, camera.height, camera.width)).astype(np.float32)
+    one, over = Passes(clock, slopes), Passes(clock, slopes)
+    layer, composing, kernels = compose(still, camera, **given), list[float](), dict[str, list[float]]()
+    for _ in range(options.repeats):
+        timed(clock, composing, compose, still, camera, **given)
+        one.run(whole, camera, rows, **given)
+        with stage_times(clock, LAYER_STAGES) as stages:
+            drawn = over.run(changing, camera, None, over=layer, **given)
+        for name, samples in stages.items():
+            kernels.setdefault(name, []).append(sum(samples))
+    ratio = sum(float(np.median(v)) for v in one.times) / sum(float(np.median(v)) for v in over.times)
+    return {
+        "threads": threads,
+        "clock": clock.__name__,
+        "compose": summary(composing),
+        "layer_megabytes": round(layer.nbytes / 1e6, 1),
+        "layer_pairs": len(layer.pairs),
+        "pairs": drawn.pair_count,
+        "evaluations": drawn.evaluation_count,
+        "in_one_set": [summary(samples) for samples in one.times],
+        "over_the_layer": [summary(samples) for samples in over.times],
+        "ratio_of_medians": round(ratio, 2),
+        "stages": {name: summary(samples) for name, samples in kernels.items()},
+    }
+
+
+class Passes:
+    """Pictures and their gradients, with the times of both."""
+
+    def __init__(self, clock: Clock, slopes: np.ndarray) -> None:
+        self.clock, self.slopes, self.work = clock, slopes, Arena()
+        self.times: tuple[list[float], list[float]] = ([], [])
+
+    def run(self, gaussians: Gaussians, camera: PinholeCamera, rows: np.ndarray | None, **options: Any) -> Rendering:
+        drawn: Rendering = timed(self.clock, self.times[0], render, gaussians, camera, arena=self.work, **options)
+        timed(self.clock, self.times[1], gradients, drawn, self.slopes, rows=rows)
+        return drawn
+
+
 def _rectangle(shape: tuple[int, int], share: float) -> np.ndarray:
     """A centred rectangle of that share of all tiles."""
     tiles = np.zeros(shape, bool)
@@ -363,6 +440,7 @@ def run(options: BenchOptions, ply: Path | None = None, device: str = "cpu") -> 
         "peak_gflops_per_core": round(peak, 1),
         "iterations": iterations,
         "throughput": [throughput(measured, peak) for measured in iterations],
+        "layer": [measure_layer(options, n) for n in sorted({1, compiler.config.NUMBA_NUM_THREADS})],
         "active_tiles": measure_shares(gaussians, camera, options),
         "compiler": measure_compiler(),
         "devices": [measure_device(gaussians, camera, options, name) for name in devices],
@@ -384,6 +462,15 @@ def report(result: dict[str, Any]) -> Iterator[str]:
     yield f"active tiles: {', '.join(parts)} (ms, least)"
     for row in result["active_tiles"]:
         yield f"  {row['tiles']:6.1%} " + " ".join(f"{row[name]['min_ms']:8.2f}" for name in parts)
+    for row in result["layer"]:
+        yield (
+            f"two figures over a layer, {row['threads']} threads ({row['clock']}): {row['ratio_of_medians']} times as "
+            f"fast as in one set; the layer takes {row['layer_megabytes']} MB, {row['compose']['median_ms']} ms"
+        )
+        for name in ("in_one_set", "over_the_layer"):
+            yield f"  {name:20} " + " ".join(f"{part['median_ms']:8.2f}" for part in row[name])
+        for name, value in row["stages"].items():
+            yield f"    {name:20} {value['min_ms']:8.2f} {value['median_ms']:8.2f}"
     for row in result["devices"]:
         columns = {**row["iteration"], f"labels in {row['views']} views": row["labels"]}
         yield f"{row['device']}, wall: " + ", ".join(f"{name} {v['median_ms']:.2f}" for name, v in columns.items())

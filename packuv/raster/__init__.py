@@ -1,7 +1,8 @@
 """CPU and GPU Gaussian rasterizers behind one pair of functions.
 
-`render` draws Gaussians with one camera, `gradients` carries derivatives of the picture back to them. The options'
-device decides who does the work, our kernels or gsplat; arrays are numpy's either way.
+`render` draws Gaussians with one camera, `gradients` carries derivatives of the picture back to them. `compose` makes
+Gaussians that stay a layer, over which a few others are drawn again and again at little cost. The options' device
+decides who does the work, our kernels or gsplat; arrays are numpy's either way.
 """
 
 from __future__ import annotations
@@ -13,12 +14,23 @@ import numpy as np
 
 from packuv.camera import PinholeCamera
 from packuv.gaussians.floats import Gaussians
-from packuv.raster import cpu
+from packuv.raster import cpu, layer
 from packuv.raster.arena import Arena
 from packuv.raster.cpu import Rendering
+from packuv.raster.layer import Layer
 from packuv.raster.picture import Gradients, RasterOptions, tile_shape
 
-__all__ = ["Arena", "Gradients", "RasterOptions", "Rendering", "gradients", "render", "tile_shape"]
+__all__ = [
+    "Arena",
+    "Gradients",
+    "Layer",
+    "RasterOptions",
+    "Rendering",
+    "compose",
+    "gradients",
+    "render",
+    "tile_shape",
+]
 
 
 def render(
@@ -31,12 +43,15 @@ def render(
     tiles: np.ndarray | None = None,
     weights: bool = False,
     arena: Arena | None = None,
+    over: Any = None,
 ) -> Any:
     """Picture of N Gaussians: `cpu.Rendering`, or `gsplat.GpuRendering` with the same fields.
 
     `tiles`, bool as `tile_shape(camera)`, names the tiles to draw; the rest shows background. `weights` asks for
-    the blending weight of each Gaussian. `arena` holds memory between calls, CPU only. Raises ValueError if
-    shapes do not fit.
+    the blending weight of each Gaussian. `arena` holds memory between calls, CPU only. `over` is a layer: the picture
+    is that of its Gaussians and these, which come behind them in order, in one set; what else the rendering tells, and
+    its gradients, are of these only. Where it is given, `tiles` must lie in its own, which None stands for, and
+    `weights` cannot be had. Raises ValueError if shapes do not fit.
     """
     if options.device == "cpu":
         return cpu.forward(
@@ -48,10 +63,34 @@ def render(
             tiles=tiles,
             weights=weights,
             arena=arena,
+            over=over,
         )
     return _gsplat().forward(
-        gaussians, camera, options=options, sh_degree=sh_degree, background=background, tiles=tiles, weights=weights
+        gaussians,
+        camera,
+        options=options,
+        sh_degree=sh_degree,
+        background=background,
+        tiles=tiles,
+        weights=weights,
+        over=over,
     )
+
+
+def compose(
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    *,
+    options: RasterOptions,
+    sh_degree: int | None = None,
+    tiles: np.ndarray | None = None,
+) -> Any:
+    """Layer of N Gaussians for one camera and these tiles: `Layer`, or `gsplat.GpuLayer`, which saves no time.
+
+    The near plane of `options` stays that of these Gaussians, whatever is drawn over them.
+    """
+    backend = layer if options.device == "cpu" else _gsplat()
+    return backend.compose(gaussians, camera, options=options, sh_degree=sh_degree, tiles=tiles)
 
 
 def gradients(

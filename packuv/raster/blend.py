@@ -56,18 +56,19 @@ _AHEAD = 8
 """List entries between asking for a cache line and using it."""
 
 BLOCKS = TILE * TILE // WIDTH
-_PLANE = TILE * TILE + WIDTH
+EVERY_BLOCK = np.int64((1 << BLOCKS) - 1)
+PLANE = TILE * TILE + WIDTH
 """Floats from plane to plane: a multiple of 4096 bytes between two of them would look like a conflict to the CPU."""
 # Planes of the state: transmittance, those of each direction, pixel centres.
 _T = 0
-_RED, _GREEN, _BLUE, _DEPTH = (_PLANE * plane for plane in range(1, 5))
-_REST, _D_RED, _D_GREEN, _D_BLUE, _D_DEPTH = (_PLANE * plane for plane in range(1, 6))
-_PIXEL_X, _PIXEL_Y = _PLANE * 6, _PLANE * 7
-_SCRATCH = _PLANE * 8
+RED_SUM, GREEN_SUM, BLUE_SUM, DEPTH_SUM = (PLANE * plane for plane in range(1, 5))
+REST, D_RED, D_GREEN, D_BLUE, D_DEPTH = (PLANE * plane for plane in range(1, 6))
+_PIXEL_X, _PIXEL_Y = PLANE * 6, PLANE * 7
+_SCRATCH = PLANE * 8
 
 
 @kernel(inner=True)
-def _scratch():
+def scratch():
     """State of a tile, aligned to cache lines: a vector across two of them costs twice."""
     raw = np.empty(_SCRATCH + 16, np.float32)
     skip = ((64 - (raw.ctypes.data & 63)) & 63) >> 2
@@ -80,7 +81,7 @@ def _scratch():
 
 
 @kernel(inner=True)
-def _still_alive(state, alive):
+def still_alive(state, alive):
     """Keep the bits of blocks with a pixel whose transmittance is above the limit."""
     remaining = alive
     while remaining != 0:
@@ -92,11 +93,11 @@ def _still_alive(state, alive):
 
 
 @kernel(inner=True)
-def _open_tile(state, columns, rows):
+def open_tile(state, columns, rows):
     """Black, transmittance 1 in the `columns` x `rows` pixels that lie in the picture and 0 outside."""
     for at in range(0, BLOCKS * WIDTH, WIDTH):
         store(state, at, splat(_f32(1)))
-        for plane in (_RED, _GREEN, _BLUE, _DEPTH):
+        for plane in (RED_SUM, GREEN_SUM, BLUE_SUM, DEPTH_SUM):
             store(state, plane + at, zeros(ALL))
     if columns < TILE or rows < TILE:
         for i in range(BLOCKS * WIDTH):
@@ -110,15 +111,16 @@ def _add(state, at, weight, value):
 
 
 @kernel(inner=True)
-def _blend_tile(sums, record, pairs, begin, end, tile_x, tile_y, state, weights):
-    """Blend a list over an open tile; returns the end of the part that was used and the number of blocks visited.
+def blend_tile(sums, record, pairs, begin, end, tile_x, tile_y, state, weights, alive):
+    """Blend a list over the blocks of an open tile that are alive.
 
+    Returns the end of the part that was used, the number of blocks visited, and the blocks that are still alive.
     Long because LLVM must see the loop over blocks with everything that stays fixed in it.
     """
     align_stack()
     zero, exponent_min, exponent_max = zeros(ALL), splat(_EXPONENT_MIN), splat(_EXPONENT_MAX)
     origin_x, origin_y = _f32(TILE * tile_x), _f32(TILE * tile_y)
-    alive, visited, i = np.int64((1 << BLOCKS) - 1), 0, begin
+    visited, i = 0, begin
     while i < end and alive != 0:
         stop = min(i + _CHECK_EVERY, end)
         while i < stop:
@@ -142,38 +144,38 @@ def _blend_tile(sums, record, pairs, begin, end, tile_x, tile_y, state, weights)
                 transmittance = load(state, at)
                 weight = transmittance * alpha
                 store(state, at, transmittance - weight)
-                _add(state, at + _RED, weight, red)
-                _add(state, at + _GREEN, weight, green)
-                _add(state, at + _BLUE, weight, blue)
-                _add(state, at + _DEPTH, weight, depth)
+                _add(state, at + RED_SUM, weight, red)
+                _add(state, at + GREEN_SUM, weight, green)
+                _add(state, at + BLUE_SUM, weight, blue)
+                _add(state, at + DEPTH_SUM, weight, depth)
                 total = fold(weight, total)
             if weights.size > 0:
                 weights[slot] = sum_lanes(total)
-        alive = _still_alive(state, alive)
-    return i, visited
+        alive = still_alive(state, alive)
+    return i, visited, alive
 
 
 @kernel(inline=True)
 def _write_vector(state, at, pixel, stride, plane, background, colour, depth, alpha):
     transmittance = load(state, at)
     for channel in range(3):
-        value = load(state, at + _RED + _PLANE * channel)
+        value = load(state, at + RED_SUM + PLANE * channel)
         value = fma(transmittance, splat(background[channel]), value)
         store_block(colour, pixel + plane * channel, stride, value)
-    store_block(depth, pixel, stride, load(state, at + _DEPTH))
+    store_block(depth, pixel, stride, load(state, at + DEPTH_SUM))
     store_block(alpha, pixel, stride, splat(_f32(1)) - transmittance)
 
 
 @kernel(inline=True)
 def _write_pixel(state, at, pixel, plane, background, colour, depth, alpha):
     for channel in range(3):
-        colour[pixel + plane * channel] = state[at + _RED + _PLANE * channel] + state[at] * background[channel]
-    depth[pixel] = state[at + _DEPTH]
+        colour[pixel + plane * channel] = state[at + RED_SUM + PLANE * channel] + state[at] * background[channel]
+    depth[pixel] = state[at + DEPTH_SUM]
     alpha[pixel] = _f32(1) - state[at]
 
 
 @kernel(inner=True)
-def _write_tile(state, tile_x, tile_y, width, height, background, colour, depth, alpha):
+def write_tile(state, tile_x, tile_y, width, height, background, colour, depth, alpha):
     """Copy a tile's state to the pictures; only pixels inside them."""
     x0, y0 = TILE * tile_x, TILE * tile_y
     inside = x0 + TILE <= width and y0 + TILE <= height
@@ -189,20 +191,35 @@ def _write_tile(state, tile_x, tile_y, width, height, background, colour, depth,
 
 
 @kernel(inner=True)
-def _fill_tile(tile_x, tile_y, width, height, background, colour, depth, alpha):
-    """Nothing but background."""
+def _fill_row(tile_x, tile_end, tile_y, width, height, background, colour, depth, alpha):
+    """Nothing but background from one tile to another of a row of tiles, line by line as memory likes it."""
+    plane = width * height
     for y in range(TILE * tile_y, min(TILE * tile_y + TILE, height)):
-        begin, end = y * width + TILE * tile_x, y * width + min(TILE * tile_x + TILE, width)
+        begin, end = y * width + TILE * tile_x, y * width + min(TILE * tile_end, width)
         for channel in range(3):
-            colour[begin + width * height * channel : end + width * height * channel] = background[channel]
+            colour[begin + plane * channel : end + plane * channel] = background[channel]
         depth[begin:end] = _f32(0)
         alpha[begin:end] = _f32(0)
 
 
 @kernel(parallel=True)
+def fill(shown, width, height, background, colour, depth, alpha):
+    """Background in all tiles but those `shown`, bool [tiles_y, tiles_x]; the pictures are flat."""
+    for y in prange(shown.shape[0]):
+        x = 0
+        while x < shown.shape[1]:
+            end = x
+            while end < shown.shape[1] and not shown[y, end]:
+                end += 1
+            if end > x:
+                _fill_row(x, end, y, width, height, background, colour, depth, alpha)
+            x = end + 1
+
+
+@kernel(parallel=True)
 def blend(sums, record, pairs, start, tiles_x, width, height, background, colour, depth, alpha, used_end, visited,
           weights, jobs):  # fmt: skip
-    """Draw every tile whose list is not empty, background elsewhere.
+    """Draw every tile whose list is not empty; the others are left to `fill`.
 
     `record` and the pictures are flat; `used_end` [tiles] receives the end of the part of each list that was used,
     `visited` [tiles] the number of blocks; `weights` [pairs] receives the sum of transmittance * alpha
@@ -210,18 +227,17 @@ def blend(sums, record, pairs, start, tiles_x, width, height, background, colour
     """
     count = start.shape[0] - 1
     for job in prange(jobs):
-        state = _scratch()
+        state = scratch()
         for tile in range(job, count, jobs):
             x, y = tile % tiles_x, tile // tiles_x
             if start[tile] == start[tile + 1]:
                 used_end[tile], visited[tile] = start[tile], 0
-                _fill_tile(x, y, width, height, background, colour, depth, alpha)
                 continue
-            _open_tile(state, width - TILE * x, height - TILE * y)
-            used_end[tile], visited[tile] = _blend_tile(
-                sums, record, pairs, start[tile], start[tile + 1], x, y, state, weights
+            open_tile(state, width - TILE * x, height - TILE * y)
+            used_end[tile], visited[tile], _ = blend_tile(
+                sums, record, pairs, start[tile], start[tile + 1], x, y, state, weights, EVERY_BLOCK
             )
-            _write_tile(state, x, y, width, height, background, colour, depth, alpha)
+            write_tile(state, x, y, width, height, background, colour, depth, alpha)
             for i in range(used_end[tile], start[tile + 1] if weights.size > 0 else 0):
                 weights[pairs[i, SLOT]] = _f32(0)
 
@@ -240,17 +256,17 @@ def sum_weights(weights, first_pair, out):
 
 
 @kernel(inner=True)
-def _gradient_tile(sums, record, pairs, begin, end, tile_x, tile_y, rows, state, partial):
+def gradient_tile(sums, record, pairs, begin, end, tile_x, tile_y, rows, state, partial, alive):
     """Walk a tile's list again; write, per pair whose row is chosen, ten sums over its pixels to its slot.
 
     The sums are of v, v dx, v dy, v dx^2, v dx dy, v dy^2 with v the gradient of the exponent (natural log), then of
     the gradients of red, green, blue and depth. Returns the end of the part of the list that was used. Long for the
-    reason that `_blend_tile` is.
+    reason that `blend_tile` is.
     """
     align_stack()
     one, zero, exponent_min, exponent_max = splat(_f32(1)), zeros(ALL), splat(_EXPONENT_MIN), splat(_EXPONENT_MAX)
     origin_x, origin_y = _f32(TILE * tile_x), _f32(TILE * tile_y)
-    alive, i = np.int64((1 << BLOCKS) - 1), begin
+    i = begin
     while i < end and alive != 0:
         stop = min(i + _CHECK_EVERY, end)
         while i < stop:
@@ -274,12 +290,12 @@ def _gradient_tile(sums, record, pairs, begin, end, tile_x, tile_y, rows, state,
                 exponent = fma(dx, fma(xx, dx, xy * dy), fma(yy * dy, dy, opacity))
                 alpha = select(at_least(exponent, exponent_min), exp2_8(smaller(exponent, exponent_max)), zero)
                 transmittance = load(state, at)
-                d_red, d_green = load(state, at + _D_RED), load(state, at + _D_GREEN)
-                d_blue, d_depth = load(state, at + _D_BLUE), load(state, at + _D_DEPTH)
+                d_red, d_green = load(state, at + D_RED), load(state, at + D_GREEN)
+                d_blue, d_depth = load(state, at + D_BLUE), load(state, at + D_DEPTH)
                 weight = transmittance * alpha
                 gain = fma(red, d_red, fma(green, d_green, fma(blue, d_blue, depth * d_depth)))
-                rest = load(state, at + _REST) - weight * gain
-                store(state, at + _REST, rest)
+                rest = load(state, at + REST) - weight * gain
+                store(state, at + REST, rest)
                 store(state, at, transmittance - weight)
                 if chosen:
                     d_alpha = transmittance * gain - rest / (one - alpha)
@@ -291,8 +307,8 @@ def _gradient_tile(sums, record, pairs, begin, end, tile_x, tile_y, rows, state,
                     s_blue, s_depth = fold_product(weight, d_blue, s_blue), fold_product(weight, d_depth, s_depth)
             if chosen:
                 store_sums(partial, slot * RECORD, (s, sx, sy, sxx, sxy, syy, s_red, s_green, s_blue, s_depth))
-        alive = _still_alive(state, alive)
-    return i
+        alive = still_alive(state, alive)
+    return i, alive
 
 
 @kernel(inline=True)
@@ -305,9 +321,9 @@ def _start_vector(state, at, pixel, stride, plane, colour, depth, alpha, d_colou
     for channel in range(3):
         gradient = load_block(d_colour, pixel + plane * channel, stride)
         rest = fma(load_block(colour, pixel + plane * channel, stride), gradient, rest)
-        store(state, at + _D_RED + _PLANE * channel, gradient)
-    store(state, at + _D_DEPTH, g_depth)
-    store(state, at + _REST, rest)
+        store(state, at + D_RED + PLANE * channel, gradient)
+    store(state, at + D_DEPTH, g_depth)
+    store(state, at + REST, rest)
     store(state, at, one)
 
 
@@ -316,12 +332,12 @@ def _start_pixel(state, at, pixel, plane, colour, depth, alpha, d_colour, d_dept
     rest = depth[pixel] * d_depth[pixel] - (_f32(1) - alpha[pixel]) * d_alpha[pixel]
     for channel in range(3):
         rest += colour[pixel + plane * channel] * d_colour[pixel + plane * channel]
-        state[at + _D_RED + _PLANE * channel] = d_colour[pixel + plane * channel]
-    state[at + _D_DEPTH], state[at + _REST], state[at] = d_depth[pixel], rest, _f32(1)
+        state[at + D_RED + PLANE * channel] = d_colour[pixel + plane * channel]
+    state[at + D_DEPTH], state[at + REST], state[at] = d_depth[pixel], rest, _f32(1)
 
 
 @kernel(inner=True)
-def _start_tile(state, tile_x, tile_y, width, height, colour, depth, alpha, d_colour, d_depth, d_alpha):
+def start_tile(state, tile_x, tile_y, width, height, colour, depth, alpha, d_colour, d_depth, d_alpha):
     """Set transmittance 1, the gradients of the pixels, and what all Gaussians together add to the loss's differential.
 
     Pixels outside the picture have gradient and transmittance zero.
@@ -342,12 +358,12 @@ def _start_tile(state, tile_x, tile_y, width, height, colour, depth, alpha, d_co
                     state, to, py * width + px, width * height, colour, depth, alpha, d_colour, d_depth, d_alpha
                 )
             else:
-                for plane in range(0, _D_DEPTH + 1, _PLANE):
+                for plane in range(0, D_DEPTH + 1, PLANE):
                     state[plane + to] = _f32(0)
 
 
 @kernel(inline=True)
-def _last_chosen(pairs, rows, begin, end):
+def last_chosen(pairs, rows, begin, end):
     """End of the list after its last pair whose row is chosen: nothing behind it matters."""
     while end > begin and rows[pairs[end - 1, GAUSSIAN]] == 0:
         end -= 1
@@ -360,12 +376,12 @@ def blend_backward(sums, record, pairs, start, used_end, tiles_x, width, height,
     """Partial gradients of pairs whose row is chosen, flat [pairs * 16]; `used` [pairs] says which slots hold one."""
     count = start.shape[0] - 1
     for job in prange(jobs):
-        state = _scratch()
+        state = scratch()
         for tile in range(job, count, jobs):
             begin, x, y = start[tile], tile % tiles_x, tile // tiles_x
-            end = _last_chosen(pairs, rows, begin, used_end[tile])
+            end = last_chosen(pairs, rows, begin, used_end[tile])
             if end > begin:
-                _start_tile(state, x, y, width, height, colour, depth, alpha, d_colour, d_depth, d_alpha)
-                end = _gradient_tile(sums, record, pairs, begin, end, x, y, rows, state, partial)
+                start_tile(state, x, y, width, height, colour, depth, alpha, d_colour, d_depth, d_alpha)
+                end, _ = gradient_tile(sums, record, pairs, begin, end, x, y, rows, state, partial, EVERY_BLOCK)
             for i in range(begin, start[tile + 1]):
                 used[pairs[i, SLOT]] = i < end and rows[pairs[i, GAUSSIAN]] != 0

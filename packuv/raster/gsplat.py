@@ -9,7 +9,7 @@ and saves no time.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from packuv.camera import PinholeCamera
 from packuv.gaussians.floats import Gaussians, arrays
-from packuv.raster.picture import Gradients, RasterOptions, checked_tiles
-from packuv.raster.view import MAX_COLOUR, MAX_LENGTH, MAX_LOG_SCALE, TILE
+from packuv.raster.picture import Composed, Gradients, RasterOptions, checked_tiles
+from packuv.raster.view import MAX_COLOUR, MAX_LENGTH, MAX_LOG_SCALE, TILE, VIEW_NEAR, view_constants
 
 _FAR = 1e10
 
@@ -44,6 +44,28 @@ class GpuRendering:
     _inputs: tuple[Tensor, ...] = field(repr=False)
 
 
+@dataclass(frozen=True)
+class GpuLayer(Composed):
+    """Gaussians that stay, drawn anew in every rendering over them: a GPU saves nothing by a layer yet."""
+
+    gaussians: Gaussians
+    sh_degree: int
+
+
+def compose(
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    *,
+    options: RasterOptions,
+    sh_degree: int | None = None,
+    tiles: np.ndarray | None = None,
+) -> GpuLayer:
+    """Arguments as in `cpu.forward`."""
+    view = view_constants(camera, options.near, options.low_pass_px2)
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    return GpuLayer(view, checked_tiles(tiles, camera), gaussians, degree)
+
+
 def forward(
     gaussians: Gaussians,
     camera: PinholeCamera,
@@ -53,6 +75,7 @@ def forward(
     background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     tiles: np.ndarray | None = None,
     weights: bool = False,
+    over: GpuLayer | None = None,
 ) -> GpuRendering:
     """Render on the torch device `options.device`; arguments as in `cpu.forward`.
 
@@ -60,15 +83,23 @@ def forward(
     """
     device = torch.device(options.device)
     leaves = tuple(torch.tensor(array, device=device, requires_grad=True) for array in arrays(gaussians))
-    scene, valid = _sanitized(*leaves)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    mask = _pixel_mask(tiles, camera, device)
+    active = None if over is None else over.tiles_to_draw(tiles, weights, camera, options)
+    mask = _pixel_mask(tiles if active is None else active > 0, camera, device)
     with torch.enable_grad():
+        if over is None:
+            scene, valid = _sanitized(*leaves)
+        else:
+            scene, valid, degree, options = _joined(over, leaves, degree, camera, options)
         values, alpha, meta = _rasterize(scene, scene["sh"], camera, options, degree, "RGB+D")
         pictures = _composed(values, alpha, mask, background)
     sums = _array(_weights(scene, camera, options, mask)) if weights else None
-    visible = _array(meta["tiles_per_gauss"].reshape(-1).to(torch.int32))
-    invalid, inputs = int((~valid).sum()), (*leaves, meta["means2d"])
+    first = 0 if over is None else len(over.gaussians)
+    touched = meta["tiles_per_gauss"].reshape(-1)
+    if over is not None:
+        touched = (touched * (scene["opacities"] > 0))[first:]
+    visible = _array(touched.to(torch.int32))
+    invalid, inputs = int((~valid[first:]).sum()), (*leaves, meta["means2d"])
     shown = [_array(picture) for picture in pictures]
     return GpuRendering(shown[0], shown[1], shown[2], visible, sums, invalid, pictures, inputs)
 
@@ -88,7 +119,8 @@ def backward(
     pictures, slopes = [picture for picture, _ in given], [slope for _, slope in given]
     found = torch.autograd.grad(pictures, rendering._inputs, slopes, allow_unused=True)
     whole = [torch.zeros_like(a) if g is None else g for g, a in zip(found, rendering._inputs, strict=True)]
-    whole[5] = whole[5].reshape(-1, 2)  # [1, N, 2] of one camera
+    whole[5] = whole[5].reshape(-1, 2)  # [1, N, 2] of one camera; those of a layer come first
+    whole[5] = whole[5][len(whole[5]) - len(whole[0]) :]
     finite = torch.stack([g.reshape(len(g), -1).isfinite().all(1) for g in whole]).all(0)
     keep = finite if rows is None else finite & torch.as_tensor(rows, device=device)
     kept = [_array(torch.where(keep.reshape(-1, *[1] * (g.ndim - 1)), g, 0)) for g in whole]
@@ -116,6 +148,33 @@ def _sanitized(
         "sh": torch.where(row[..., None], sh, 0),
     }
     return scene, valid
+
+
+def _joined(
+    layer: GpuLayer, leaves: tuple[Tensor, ...], degree: int, camera: PinholeCamera, options: RasterOptions
+) -> tuple[dict[str, Tensor], Tensor, int, RasterOptions]:
+    """Inputs and which rows are valid, as from `_sanitized`, of a layer and `leaves`; degree and options for both.
+
+    Each keeps its degree and near plane: coefficients are filled up with zeros, what is too near has opacity 0.
+    """
+    still = [torch.as_tensor(array, device=leaves[0].device) for array in arrays(layer.gaussians)]
+    highest, near = max(degree, layer.sh_degree), float(layer.view[VIEW_NEAR])
+    both = [torch.cat(pair) for pair in zip(still[:4], leaves[:4], strict=True)]
+    sh = [_of_degree(still[4], layer.sh_degree, highest), _of_degree(leaves[4], degree, highest)]
+    scene, valid = _sanitized(*both, torch.cat(sh))
+    pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32, device=leaves[0].device)
+    depth = scene["means"].detach() @ pose[2, :3] + pose[2, 3]
+    planes = torch.full_like(depth, options.near)
+    planes[: len(still[0])] = near
+    scene["opacities"] = torch.where(depth >= planes, scene["opacities"], 0)
+    return scene, valid, highest, replace(options, near=min(near, options.near))
+
+
+def _of_degree(sh: Tensor, degree: int, highest: int) -> Tensor:
+    """Coefficients [N, (highest + 1) ** 2, 3], zero above `degree`."""
+    out = torch.zeros((len(sh), (highest + 1) ** 2, 3), device=sh.device)
+    out[:, : (degree + 1) ** 2] = sh[:, : (degree + 1) ** 2]
+    return out
 
 
 def _rasterize(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.raster.view import TILE
+from packuv.raster.view import TILE, VIEW_NEAR, view_constants
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,37 @@ class Gradients:
     """float32 [N, 2]: of the centre in the picture, per pixel"""
     overflow_count: int
     """Rows set to zero because their gradient was not finite"""
+
+
+@dataclass(frozen=True)
+class Composed:
+    """What holds of every layer: the camera and the tiles that it was made for."""
+
+    view: np.ndarray
+    """float64 [27], see `view`; of all that is drawn over it, too, but for the near plane"""
+    active: np.ndarray
+    """uint8 [tiles_y, tiles_x]: where it can be drawn over"""
+
+    def tiles_to_draw(
+        self, tiles: np.ndarray | None, weights: bool, camera: PinholeCamera, options: RasterOptions
+    ) -> np.ndarray:
+        """uint8 [tiles_y, tiles_x], from the arguments of a rendering. Raises ValueError where they do not fit."""
+        if weights:
+            raise ValueError("blending weights over a layer are not computed; render all Gaussians in one set")
+        view = view_constants(camera, options.near, options.low_pass_px2)
+        if not np.array_equal(np.delete(view, VIEW_NEAR), np.delete(self.view, VIEW_NEAR)):
+            raise ValueError(
+                "a layer must be drawn over with the camera and the low-pass filter that it was composed with, "
+                f"but camera {camera.name!r} or its filter is another"
+            )
+        active = self.active if tiles is None else checked_tiles(tiles, camera)
+        lacking = int(np.sum(active > self.active))
+        if lacking:
+            raise ValueError(
+                f"the tiles to draw must be among the {self.active.sum()} that the layer was composed for, "
+                f"but {lacking} of {active.sum()} are not"
+            )
+        return active
 
 
 def tile_shape(camera: PinholeCamera) -> tuple[int, int]:

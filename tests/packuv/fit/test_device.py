@@ -24,7 +24,7 @@ from packuv.fit.options import FitOptions
 from packuv.fit.shots import Shot
 from packuv.fit.solver import Solver
 from packuv.fit.start.bounds import Bounds
-from packuv.raster import RasterOptions, gradients, render, tile_shape
+from packuv.raster import RasterOptions, compose, gradients, render, tile_shape
 from tests.support.dense_raster import BACKGROUND, blend, camera, ellipses, scene, sh_colour, upstream
 from tests.support.needs import needs
 
@@ -102,6 +102,24 @@ def test_broken_gaussians_are_left_out_and_counted(gsplat):
     found = gradients(there, *upstream(view))
     assert all(np.isfinite(getattr(found, name)).all() for name in ("means", "log_scales", "quaternions", "sh"))
     assert not found.means[[3, 5, 7, 9, 11]].any()
+
+
+def test_a_layer_is_drawn_with_what_changes_and_gets_no_gradient(gsplat):
+    still, moving, view = scene(60), scene(20, seed=1, degree=1), camera()
+    moving.means[3, 1] = np.nan
+    found = []
+    for stand_in in (replace(OPTIONS, device="cpu"), OPTIONS):
+        layer = compose(still, view, options=replace(stand_in, near=3.5), sh_degree=2)
+        drawn = render(moving, view, options=replace(stand_in, near=4.0), background=BACKGROUND, over=layer)
+        found.append((drawn, gradients(drawn, *upstream(view))))
+    (here, expected), (there, got) = found
+    assert np.abs(there.colour - here.colour).max() < 1e-5
+    assert here.invalid_count == there.invalid_count == 1
+    assert np.array_equal(here.visible > 0, (there.visible > 0) & (here.visible > 0))
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh", "means2d"):
+        truth = getattr(expected, name)
+        assert getattr(got, name).shape == truth.shape
+        assert np.linalg.norm(getattr(got, name) - truth) < 1e-4 * np.linalg.norm(truth)
 
 
 def test_tiles_that_are_not_asked_for_show_background_and_give_no_gradient(gsplat):
