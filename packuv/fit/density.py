@@ -58,9 +58,16 @@ class ScreenGradient:
 
 
 def prune(
-    model: Model, gradient: ScreenGradient, *, bounds: Bounds, options: DensityOptions, uv: UvOptions
+    model: Model,
+    gradient: ScreenGradient,
+    taken: np.ndarray,  # float32 [B, 3]
+    *,
+    bounds: Bounds,
+    options: DensityOptions,
+    uv: UvOptions,
 ) -> np.ndarray:
-    """Rows worth keeping, bool [N]: opaque, not huge, contributing, and with a place in the UV map (max-K pruning)."""
+    """Rows worth keeping, bool [N]: opaque, not huge, contributing, and with a place in the UV map (max-K pruning)
+    beside the Gaussians at `taken`, whose places are reserved."""
     g = model.gaussians
     keep = opacity(g) > options.min_opacity
     keep &= g.log_scales.max(axis=1) < np.log(options.max_scale * bounds.radius)
@@ -68,8 +75,9 @@ def prune(
     if options.min_gradient > 0:
         keep &= (gradient.seen == 0) | (gradient.mean >= options.min_gradient)
     rows = np.flatnonzero(keep)
-    slots = assign_slots(g.means[rows], g.opacity_logits[rows], bounds.centre, options=uv)
-    keep[rows] = slots.kept
+    means, reserved = np.concatenate([taken, g.means[rows]]), np.full(len(taken), np.inf)
+    slots = assign_slots(means, np.concatenate([reserved, g.opacity_logits[rows]]), bounds.centre, options=uv)
+    keep[rows] = slots.kept[len(taken) :]
     return keep
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from packuv.files import save_json, save_npz
+from packuv.fit.backdrop import Backdrop
 from packuv.fit.keyframe import DEAD_CODE, KeyState
 from packuv.fit.lift import lift_motion
 from packuv.fit.model import Model
@@ -20,7 +21,7 @@ from packuv.fit.solver import Solver, tiled
 from packuv.fit.start.first import empty_gaussians
 from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY, Codes
-from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity
+from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity, rows_of
 from packuv.gaussians.segment import Segment
 from packuv.motion import MotionCache
 from packuv.progress import Progress, Ticks, no_progress
@@ -42,12 +43,12 @@ def fit_segment(
     """
     if instants.start != key.instant:
         raise ValueError(f"a segment starts at its keyframe, instant {key.instant}, not at {instants.start}")
-    track = Track.resume(key, options, scratch)
+    track, backdrop = Track.resume(key, options, scratch), key.open_backdrop(options.device)
     ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
     for instant in instants[1 + len(track.frames) :]:
         masks = [motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras]
         optical_flows = [motion.optical_flow(motion.names.index(camera.name), instant) for camera in views.cameras]
-        track.add(_fit_frame(track.model, key, views, instant, masks, optical_flows, options))
+        track.add(_fit_frame(track.model, key, backdrop, views, instant, masks, optical_flows, options))
         track.checkpoint()
         ticks.advance()
     return track.segment(instants.start), track.figures
@@ -56,6 +57,7 @@ def fit_segment(
 def _fit_frame(
     model: Model,
     key: KeyState,
+    backdrop: Backdrop,
     views: Views,
     instant: int,
     masks: Sequence[np.ndarray | None],
@@ -68,14 +70,12 @@ def _fit_frame(
     if not any(mask is not None and mask.any() for mask in masks):
         return rows, {"instant": instant, "seconds": time.monotonic() - started, "iterations": 0, "dynamic": 0}
     rng = np.random.default_rng([options.seed, instant, 2])
-    solver = Solver(model, key.bounds, options, rng)
+    solver = Solver(model, key.bounds, options, rng, backdrop)
     solver.fix(key.quantizer)
     rows = moving_rows(model.gaussians, key.quantizer, views, masks, key.bounds, options)
-    rows[: key.backdrop] = False
     model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, optical_flows, masks,
                                                near=key.bounds.near, options=options.lift)  # fmt: skip
     spare = opacity(model.gaussians) <= options.density.min_opacity
-    spare[: key.backdrop] = False
     model.forget_moments(np.flatnonzero(rows | spare))
     solver.free(rows | spare)
     shots = tiled(find_shots(views, instant, masks), masks, solver, views)
@@ -93,7 +93,8 @@ def _fit_frame(
 
 
 class Track:
-    """A segment while it is fitted: the model, and the codes and figures of the frames that are done."""
+    """A segment while it is fitted: the model, and the codes and figures of the frames that are done; none of them
+    holds the backdrop."""
 
     def __init__(self, key: KeyState, model: Model, scratch: Path) -> None:
         self.model = model
@@ -107,7 +108,7 @@ class Track:
     @classmethod
     def resume(cls, key: KeyState, options: FrameOptions, scratch: Path) -> Track:
         """Where the last call was cut off, or at the keyframe."""
-        model = Model(key.gaussians)
+        model = Model(key.foreground)
         model.append(empty_gaussians(options.spare, key.bounds, sh_degree=key.quantizer.sh_degree))
         track = cls(key, model, scratch)
         path = scratch / "track.json"
@@ -133,11 +134,12 @@ class Track:
         (self._scratch / f"state_{count - 1:06d}.npz").unlink(missing_ok=True)
 
     def segment(self, first: int) -> Segment:
-        """The codes of all frames from instant `first` on; rows that are never visible are left out."""
+        """The codes of all frames from instant `first` on, after those of the backdrop; rows that are never visible are
+        left out."""
         ever = self._first.attributes[:, OPACITY] > DEAD_CODE
         for codes in self.frames:
             ever |= codes.attributes[:, OPACITY] > DEAD_CODE
-        dynamic = self._changed & ever
+        dynamic, own = self._changed & ever, self._first[ever]
         width = self._first.attributes.shape[1]
         xyz = (
             np.stack([c.xyz[dynamic] for c in self.frames])
@@ -146,7 +148,9 @@ class Track:
         )
         attributes = (np.stack([c.attributes[dynamic] for c in self.frames])
                       if self.frames else np.empty((0, dynamic.sum(), width), np.uint8))  # fmt: skip
-        return Segment(first, self._first[ever], dynamic[ever], xyz, attributes)
+        still = self._key.quantizer.encode(rows_of(self._key.gaussians, slice(0, self._key.backdrop)))
+        whole = Codes(*(np.concatenate(pair) for pair in ((still.xyz, own.xyz), (still.attributes, own.attributes))))
+        return Segment(first, whole, np.concatenate([np.zeros(len(still), bool), dynamic[ever]]), xyz, attributes)
 
     def _load(self, figures: list[dict[str, Any]]) -> None:
         count = len(figures)

@@ -69,7 +69,8 @@ class Guard:
     def _inspect(self, model: Model, gradients: Mapping[str, np.ndarray] | None, rows: np.ndarray) -> np.ndarray:
         """int8 [N]: 0 for a row in order, else 1 + the place of the attribute, plus 5 if its gradient is at fault."""
         count = len(model)
-        flat = {name: getattr(model.gaussians, name).reshape(count, -1) for name in ATTRIBUTES}
+        flat = {name: getattr(model.gaussians, name) for name in ATTRIBUTES}
+    flat = {name: values.reshape(count, math.prod(values.shape[1:])) for name, values in flat.items()}
         slopes = flat if gradients is None else {name: gradients[name].reshape(count, -1) for name in ATTRIBUTES}
         good = [getattr(self._good, name).reshape(count, -1) for name in ATTRIBUTES]
         faults = np.zeros(count, np.int8)

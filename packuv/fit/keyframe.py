@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from packuv.files import save_json, save_npz
+from packuv.fit.backdrop import Backdrop, joined
 from packuv.fit.losses import photometric_loss
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
@@ -60,6 +61,16 @@ class KeyState:
     bounds: Bounds
     figures: Mapping[str, Any]
     """What the fit measured: seconds, loss and its terms, Gaussians"""
+
+    @property
+    def foreground(self) -> Gaussians:
+        """Rows after those of the backdrop"""
+        return rows_of(self.gaussians, slice(self.backdrop, None))
+
+    def open_backdrop(self, device: str) -> Backdrop:
+        """The backdrop, to draw over."""
+        still = rows_of(self.gaussians, slice(0, self.backdrop))
+        return Backdrop(self.quantizer.decode(self.quantizer.encode(still)), self.bounds.near, device)
 
     def save(self, folder: Path) -> None:
         """Write state.npz and key.json."""
@@ -167,24 +178,19 @@ def fit_next(
     started = time.monotonic()
     bounds, quantizer = previous.bounds, previous.quantizer
     rng = np.random.default_rng([options.seed, instant, 1])
-    model = Model(previous.gaussians)
-    solver = Solver(model, bounds, options, rng)
+    model = Model(previous.foreground)
+    solver = Solver(model, bounds, options, rng, previous.open_backdrop(options.device))
     solver.fix(quantizer)
     standing = _standing(views, instant, stills, motion)
     masks = standing if previous.instant is None else _changes(views, previous.instant, instant, motion)
     shots = find_shots(views, instant, masks)
     if not shots:
         return replace(previous, instant=instant, figures=_figures(started, {}, solver))
-    gone = np.zeros(len(model), bool)
     if previous.instant is not None:
         before = _standing(views, previous.instant, stills, motion)
         gone = _inside(model.gaussians, views, before, bounds, options)
-        gone &= ~_inside(model.gaussians, views, standing, bounds, options)
-        gone[: previous.backdrop] = False
-    solver.keep(~gone)
-    rows = moving_rows(model.gaussians, quantizer, views, masks, bounds, options)
-    rows[: previous.backdrop] = False
-    solver.free(rows)
+        solver.keep(~gone | _inside(model.gaussians, views, standing, bounds, options))
+    solver.free(moving_rows(model.gaussians, quantizer, views, masks, bounds, options))
     solver.make_room(shots)
     seen = [mask if alone is None else alone for alone, mask in zip(standing, masks, strict=True)]
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
@@ -192,7 +198,8 @@ def fit_next(
     losses = solver.run(shots, options.key_iterations, of=options.key_iterations, grow_from=len(model),
                       ticks=Ticks(progress, options.key_iterations))  # fmt: skip
     solver.keep(~solver.rows | solver.worth_keeping())
-    return KeyState(instant, model.gaussians, previous.backdrop, quantizer, bounds, _figures(started, losses, solver))
+    gaussians = joined(rows_of(previous.gaussians, slice(0, previous.backdrop)), model.gaussians)
+    return replace(previous, instant=instant, gaussians=gaussians, figures=_figures(started, losses, solver))
 
 
 def _changes(views: Views, first: int, last: int, motion: MotionOptions) -> list[np.ndarray | None]:
@@ -307,7 +314,7 @@ def _figures(started: float, losses: Losses, solver: Solver) -> dict[str, Any]:
         "seconds": time.monotonic() - started,
         "loss": sum(losses.values()),
         "losses": dict(losses),
-        "gaussians": len(solver.model),
+        "gaussians": len(solver.backdrop) + len(solver.model),
         "changed": int(solver.rows.sum()),
         "iterations": solver.done,
         "guarded": solver.guarded,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from packuv.fit.backdrop import Backdrop
 from packuv.fit.density import ScreenGradient, grow, prune, relocate
 from packuv.fit.guard import Guard
 from packuv.fit.labels import active_tiles
@@ -47,14 +49,26 @@ def mean_losses(losses: Sequence[Losses]) -> Losses:
 class Solver:
     """Iterations over the pictures of one instant."""
 
-    def __init__(self, model: Model, bounds: Bounds, options: SolverOptions, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        model: Model,
+        bounds: Bounds,
+        options: SolverOptions,
+        rng: np.random.Generator,
+        backdrop: Backdrop | None = None,
+    ) -> None:
+        """`backdrop` is drawn with the model's Gaussians, and is not changed."""
         self.model = model
+        self.backdrop = backdrop or Backdrop(rows_of(model.gaussians, slice(0, 0)), bounds.near)
         self.rows = np.ones(len(model), bool)
         """Which Gaussians may change"""
         self.gradient = ScreenGradient(len(model))
         self._quantizer: Quantizer | None = None
         self._drawn: Gaussians | None = None
         self.bounds = bounds
+        self.cap = max(0, options.density.cap - len(self.backdrop))
+        """Gaussians of the model at most"""
+        self._layers: dict[int, Any] = {}
         self._options = options
         self._rng = rng
         self._order: list[int] = []
@@ -86,19 +100,17 @@ class Solver:
 
     def append(self, born: Gaussians) -> None:
         """Add Gaussians that may change, the first ones as far as the cap leaves room."""
-        born = rows_of(born, slice(0, max(0, self._options.density.cap - len(self.model))))
+        born = rows_of(born, slice(0, max(0, self.cap - len(self.model))))
         self.model.append(born)
         self.rows = np.concatenate([self.rows, np.ones(len(born), bool)])
         self._start_afresh()
 
     def make_room(self, shots: Sequence[Shot]) -> None:
         """Drop what exceeds the cap: of the rows that may change, those that show least in the pictures."""
-        excess = len(self.model) - self._options.density.cap
+        excess = len(self.model) - self.cap
         if excess <= 0:
             return
-        drawn, raster = self._decoded(), RasterOptions(self.bounds.near, device=self._options.device)
-        shown = [render(drawn, shot.camera, options=raster, weights=True, arena=self._arena).weights
-                 for shot in shots]  # fmt: skip
+        shown = [self.backdrop.shares(self._decoded(), shot.camera, self._arena) for shot in shots]
         rows, stays = np.flatnonzero(self.rows), np.ones(len(self.model), bool)
         stays[rows[np.argsort(np.sum(shown, axis=0)[rows], kind="stable")[:excess]]] = False
         self.keep(stays)
@@ -116,11 +128,11 @@ class Solver:
         With `grow_from` Gaussians in the beginning, their number grows towards the cap; without it stays.
         """
         losses: list[Losses] = []
-        self._order = []
+        self._order, self._layers = [], {}
         density = self._options.density
         for _ in range(count):
-            shot, opaque = shots[self._next(shots)], self._options.random_background
-            losses.append(self._iterate(shot, self._near(), progress=self.done / of, opaque=opaque))
+            index, opaque = self._next(shots), self._options.random_background
+            losses.append(self._iterate(shots, index, self._near(), progress=self.done / of, opaque=opaque))
             if grow_from is not None and self.done % density.every == 0 and self.done < of * density.until:
                 self._change_density(of, grow_from)
             if ticks:
@@ -160,7 +172,7 @@ class Solver:
         losses: dict[int, Losses] = {}
         for _ in range(count):
             index, near = self._next(shots), self._near()
-            found = self._iterate(shots[index], near, progress=0.0, scale=rate_scale)
+            found = self._iterate(shots, index, near, progress=0.0, scale=rate_scale)
             if near == self.bounds.near:
                 losses[index] = found
         return losses
@@ -171,10 +183,28 @@ class Solver:
             self._order = list(self._rng.permutation(len(shots)))
         return self._order.pop()
 
-    def _iterate(self, shot: Shot, near: float, *, progress: float, scale: float = 1.0, opaque: bool = False) -> Losses:
-        options = self._options
+    def _iterate(
+        self,
+        shots: Sequence[Shot],
+        index: int,
+        near: float,
+        *,
+        progress: float,
+        scale: float = 1.0,
+        opaque: bool = False,
+    ) -> Losses:
+        options, shot = self._options, shots[index]
         raster = RasterOptions(near, device=options.device)
-        rendering = render(self._decoded(), shot.camera, options=raster, tiles=shot.tiles, arena=self._arena)
+        if index not in self._layers:
+            self._layers[index] = self.backdrop.layer(shot.camera, shot.tiles)
+        rendering = render(
+            self._decoded(),
+            shot.camera,
+            options=raster,
+            tiles=shot.tiles,
+            arena=self._arena,
+            over=self._layers[index],
+        )
         moving = self.rows & (rendering.visible > 0)
         behind = self._behind(shot.target) if opaque else None
         colour = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
@@ -233,7 +263,8 @@ class Solver:
 
     def worth_keeping(self) -> np.ndarray:
         """Rows that pruning leaves, bool [N]."""
-        return prune(self.model, self.gradient, bounds=self.bounds, options=self._options.density, uv=self._options.uv)
+        options, taken = self._options, self.backdrop.gaussians.means
+        return prune(self.model, self.gradient, taken, bounds=self.bounds, options=options.density, uv=options.uv)
 
     def _change_density(self, of: int, grow_from: int) -> None:
         """Prune, then grow towards the cap."""
@@ -242,8 +273,8 @@ class Solver:
         score = np.where(self.rows & kept & (self.gradient.seen > 0), self.gradient.mean, 0)[kept]
         self.keep(kept)
         share = min(1.0, self.done / (of * options.until))
-        target = round(grow_from + (options.cap - grow_from) * share)
-        count = max(0, min(target, options.cap) - len(self.model))
+        target = round(grow_from + (self.cap - grow_from) * share)
+        count = max(0, min(target, self.cap) - len(self.model))
         before = len(self.model)
         grow(self.model, score, count, bounds=self.bounds, options=options, rng=self._rng)
         self.rows = np.concatenate([self.rows, np.ones(len(self.model) - before, bool)])

@@ -111,7 +111,7 @@ class Quantizer:
         """Nearest codes; values outside their range saturate, see `saturation`."""
         count, columns = len(gaussians), len(self.low)
         xyz, attributes = np.empty((count, 3), np.uint16), np.empty((count, columns), np.uint8)
-        flat, scale = gaussians.sh.reshape(count, -1), 255 / (self.high - self.low)
+        flat, scale = _flat(gaussians.sh), 255 / (self.high - self.low)
         place = self.centre, self.unit, self._edge
         _encode(*arrays(gaussians)[:4], flat, *place, self.low, scale, xyz, attributes)
         return Codes(xyz, attributes)
@@ -124,7 +124,7 @@ class Quantizer:
         if into is None:
             shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, coefficients, 3)]
             into = Gaussians(*(np.empty(shape, np.float32) for shape in shapes))
-        tables, flat = (self.xyz_table, self.attribute_table), into.sh.reshape(len(into), -1)
+        tables, flat = (self.xyz_table, self.attribute_table), _flat(into.sh)
         _decode(codes.xyz, codes.attributes, *tables, *arrays(into)[:4], flat)
         return into
 
@@ -161,13 +161,18 @@ class Quantizer:
         return cls(unit=positive(field(data, "unit", what), "the quantizer's unit"), sh_degree=degree, **arrays)
 
 
+def _flat(sh: np.ndarray) -> np.ndarray:
+    """[N, K, 3] as [N, 3 K], a view."""
+    return sh.reshape(len(sh), 3 * sh.shape[1])
+
+
 def attribute_values(gaussians: Gaussians) -> np.ndarray:
     """The 8-bit columns as floats, [N, A]; the quaternion is normalised with w >= 0."""
     q = gaussians.quaternions
     q = q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-12)
     vector = np.where(q[:, :1] < 0, -q[:, 1:], q[:, 1:])
     return np.concatenate(
-        [gaussians.log_scales, vector, gaussians.opacity_logits[:, None], gaussians.sh.reshape(len(gaussians), -1)],
+        [gaussians.log_scales, vector, gaussians.opacity_logits[:, None], _flat(gaussians.sh)],
         axis=1,
     )
 

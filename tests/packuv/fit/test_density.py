@@ -8,6 +8,7 @@ from packuv.fit.start.first import round_gaussians
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, opacity
 from packuv.gaussians.uvsize import UvOptions
 
+NOTHING = np.empty((0, 3), np.float32)
 BOUNDS = Bounds(np.zeros(3), 2.0, 0.2)
 UV = UvOptions(rows=64, columns=64, layers=4)
 
@@ -56,7 +57,7 @@ def test_pruning_takes_the_faint_the_huge_the_lost_and_what_the_map_has_no_room_
     m.gaussians.means[2] = np.nan
     m.gaussians.means[10:60] = [1.0, 0.5, 0.2]  # one texel, four layers
     m.gaussians.opacity_logits[10:14] = 2.0
-    keep = prune(m, ScreenGradient(len(m)), bounds=BOUNDS, options=DensityOptions(), uv=UV)
+    keep = prune(m, ScreenGradient(len(m)), NOTHING, bounds=BOUNDS, options=DensityOptions(), uv=UV)
     assert not keep[:3].any()
     assert keep[10:60].sum() <= UV.layers
     assert keep[10:14].sum() >= keep[14:60].sum()
@@ -67,7 +68,7 @@ def test_pruning_by_gradient_takes_what_contributes_less_than_the_threshold():
     gradient = ScreenGradient(5)
     gradient.add(np.array([[1e-6, 0], [1e-2, 0], [0, 1e-6], [0, 1e-2], [0, 0]]), np.array([1, 1, 1, 1, 0]), 100, 100)
     options = DensityOptions(min_gradient=1e-3)
-    keep = prune(m, gradient, bounds=BOUNDS, options=options, uv=UvOptions())
+    keep = prune(m, gradient, NOTHING, bounds=BOUNDS, options=options, uv=UvOptions())
     assert keep.tolist() == [False, True, False, True, True]  # the last one was never drawn
 
 
