@@ -1,4 +1,4 @@
-"""Following a camera: what moves is where the filmed pictures changed, tOF how far the rendered motion is from theirs."""
+"""Following a camera: what moves is where filmed pictures changed, tOF how far the rendered motion is from theirs."""
 
 from __future__ import annotations
 
