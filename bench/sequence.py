@@ -42,7 +42,7 @@ def gather(folder: Path) -> dict[str, Any]:
         "seconds": {stage: round(sum(_of(run, stage, "seconds")), 1) for stage in parts},
         "peak_memory_bytes": max(value for stage in parts for value in _of(run, stage, "peak_memory_bytes")),
         "scores": {name: metrics[name] for name in ("mean", "by_camera", "seam")},
-        "psnr_db_over_time": _over_time(parts["evaluate"][0] / "metrics.arrow"),
+        **_over_time(parts["evaluate"][0] / "metrics.arrow"),
         "frames": metrics["frames"],
         "bytes": metrics["bytes"],
         "keyframes": {k["instant"]: {name: k["figures"].get(name) for name in _KEY_FIGURES} for k in keys},
@@ -61,14 +61,20 @@ def _of(run: Mapping[str, Any], stage: str, field: str) -> Iterator[float]:
     return (item[field] or 0 for item in run["artefacts"] if item["artefact"].startswith(f"{stage}/"))
 
 
-def _over_time(path: Path) -> dict[int, float]:
-    """PSNR of some frames, mean over the scored cameras that filmed them."""
+def _over_time(path: Path) -> dict[str, dict[int, float]]:
+    """PSNR of some frames, dB: raw, calibrated, own gain, moving and still; means over the cameras that filmed them."""
     rows = pyarrow.ipc.open_file(path).read_all().to_pylist()
+    names = [name for name in rows[0] if name.startswith("psnr") and name.endswith("_db")]
+    return {f"{name}_over_time": _some(rows, name) for name in names}
+
+
+def _some(rows: Sequence[Mapping[str, Any]], name: str) -> dict[int, float]:
     by_frame: dict[int, list[float]] = {}
     for row in rows:
-        by_frame.setdefault(row["frame"], []).append(row["psnr_db"])
-    chosen = np.linspace(0, len(by_frame) - 1, min(_POINTS_IN_TIME, len(by_frame))).round().astype(int)
+        if row[name] is not None:
+            by_frame.setdefault(row["frame"], []).append(row[name])
     frames = sorted(by_frame)
+    chosen = np.linspace(0, len(frames) - 1, min(_POINTS_IN_TIME, len(frames))).round().astype(int)
     return {frames[i]: round(mean(by_frame[frames[i]]), 2) for i in chosen}
 
 

@@ -1,10 +1,12 @@
-"""How good pictures of a scene are beside what cameras filmed: PSNR, SSIM and what a common gain explains."""
+"""How good pictures of a scene are beside what cameras filmed: PSNR and SSIM, what a common gain explains, moving and
+still areas apart, motion, flicker, LPIPS. docs/scores.md defines each.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -17,7 +19,8 @@ from packuv.colour import linear_from_srgb, lit, srgb_from_linear
 from packuv.files import save_json
 from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
-from packuv.metrics import psnr, ssim
+from packuv.metrics import decibels, psnr, ssim, trend
+from packuv.motion import Follower
 from packuv.progress import Progress
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene
@@ -26,7 +29,7 @@ from packuv.tables import column_types
 
 @dataclass(frozen=True)
 class Score:
-    """One picture against its truth. PSNR in dB; None where the two are equal."""
+    """One picture against its truth. PSNR in dB; None where the two are equal, or there is no such area."""
 
     frame: Annotated[int, pa.int32()]
     time_ns: int
@@ -44,19 +47,41 @@ class Score:
     flicker: float | None
     """Mean absolute change, since the camera's last frame, of the difference between render and truth in the rig's
     colour: what blinks in the render but not in the truth, whatever moves. None in a first frame"""
+    psnr_moving_db: float | None
+    """Of the calibrated render, where the camera's filmed picture moved since its last one. None in a first frame"""
+    psnr_still_db: float | None
+    """Likewise, everywhere else"""
+    moving_share: float | None
+    """Of the picture; None in a first frame"""
+    tof_px: float | None
+    """tOF: mean length of the difference between optical flow of filmed and of rendered pictures since the camera's
+    last frame, pixels. None in a first frame"""
+    lpips: float | None
+    """Of the calibrated render; None where no backbone weights were given"""
+    psnr_never_moving_db: float | None = None
+    """Of the calibrated render, in blocks of a fortieth of the picture's width through which nothing moves in any
+    scored frame"""
 
 
 SCHEMA = pa.schema(list(column_types(Score).items()))
 FIGURES = tuple(column.name for column in SCHEMA if column.type == pa.float64())
 """Fields of which means say something"""
+TRENDS = {"still_trend_db": "psnr_still_db", "never_moving_trend_db": "psnr_never_moving_db"}
+"""What is said of their course, dB per 100 frames"""
+BLOCKS = 40
+"""Across a picture, by which places are known through which nothing ever moves"""
+
+Measure = Callable[[np.ndarray, np.ndarray], float]
+"""Of a picture and its truth, float32 [3, H, W], sRGB"""
 
 
-def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
+def score(scene: Scene, views: Views, progress: Progress, *, lpips: Measure | None = None) -> list[Score]:
     """Score every frame on all cameras of the views, whose instant i is frame i of the scene.
 
     A camera without a picture at an instant is not scored there.
     """
     artist, scores = Artist(scene), list[Score]()
+    watches = [_Watch() for _ in views.cameras]
     last: dict[str, np.ndarray] = {}
     gaussians = None
     for frame in range(len(scene)):
@@ -74,9 +99,68 @@ def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
             last[camera.name] = error
             held_out = camera.name in scene.header.held_out
             raw, calibrated, own = (_likeness(picture, truth) for picture in (seen, shown, with_own_gain(shown, truth)))
-            scores.append(Score(frame, time_ns, camera.name, held_out, *raw, *calibrated, *own, flicker))
+            areas = watches[index].see(*_steady(views, index, frame, drawn, shown), error)
+            perceived = lpips(shown, truth) if lpips else None
+            scores.append(
+                Score(frame, time_ns, camera.name, held_out, *raw, *calibrated, *own, flicker, *areas, perceived)
+            )
         progress(frame + 1, len(scene), f"{_mean([s.psnr_calibrated_db for s in scores]) or 0:.2f} dB")
-    return scores
+    never = {name: watch.never_moving() for name, watch in zip(views.names, watches, strict=True)}
+    return [replace(item, psnr_never_moving_db=next(never[item.camera])) for item in scores]
+
+
+def _steady(
+    views: Views, camera: int, instant: int, drawn: np.ndarray, shown: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What was filmed and what is rendered, uint8 [H, W, 3] both, as the camera films it in steady light."""
+    filmed = views.steady(camera, instant)
+    assert filmed is not None  # for it was scored
+    return filmed, as_pixels(shown if views.light is None else views.response(camera, None).shown(drawn))
+
+
+Areas = tuple[float | None, float | None, float | None, float | None]
+"""PSNR of what moves and of what is still, dB, share of the picture that moves, tOF in pixels"""
+
+
+@dataclass
+class _Watch:
+    """One camera's pictures from frame to frame: what moves in them, and the errors of places where nothing does."""
+
+    follower: Follower = field(default_factory=Follower)
+    blocks: list[np.ndarray] = field(default_factory=list)
+    """Mean squared errors of each picture, float32 [rows, BLOCKS]: two kilobytes a picture"""
+    moved: np.ndarray | None = None
+    """bool [rows, BLOCKS]: something moved there at some time"""
+
+    def see(self, filmed: np.ndarray, render: np.ndarray, error: np.ndarray) -> Areas:
+        """The next picture; `error` is float32 [3, H, W]."""
+        squared = np.square(error).mean(axis=0)  # [H, W]
+        self.blocks.append(_shrunk(squared))
+        change = self.follower.step(filmed, render)
+        if change is None:
+            return None, None, None, None
+        moved = _shrunk(change.moving.astype(np.float32)) > 0
+        self.moved = moved if self.moved is None else self.moved | moved
+        share = float(change.moving.mean())
+        return _level(squared[change.moving]), _level(squared[~change.moving]), share, change.tof_px
+
+    def never_moving(self) -> Iterator[float | None]:
+        """PSNR of each picture where nothing ever moved, dB."""
+        still = ~self.moved if self.moved is not None else np.zeros_like(self.blocks[0], dtype=bool)
+        return (_level(block[still]) for block in self.blocks)
+
+
+def _shrunk(plane: np.ndarray) -> np.ndarray:
+    """Means over blocks of a float32 [H, W]: [rows, BLOCKS]."""
+    height, width = plane.shape
+    size = min(BLOCKS, width), max(1, min(height, round(BLOCKS * height / width)))
+    return cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+
+
+def _level(squared: np.ndarray) -> float | None:
+    """PSNR of squared errors, dB; None without any, or where all are 0."""
+    mean = float(squared.mean(dtype=np.float64)) if squared.size else 0.0
+    return decibels(mean) if mean else None
 
 
 def segment_starts(scene: Scene) -> list[int]:
@@ -136,8 +220,13 @@ def with_own_gain(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
     """float32 [3, H, W] in [0, 1], RGB, as an 8-bit PNG."""
-    pixels = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8).transpose(1, 2, 0)
-    path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, ::-1]))[1].tobytes())
+    path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(as_pixels(picture)[:, :, ::-1]))[1].tobytes())
+
+
+def as_pixels(picture: np.ndarray) -> np.ndarray:
+    """float32 [3, H, W] as uint8 [H, W, 3], clipped to [0, 1] first."""
+    pixels: np.ndarray = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8).transpose(1, 2, 0)
+    return pixels
 
 
 def write_table(path: Path, scores: Sequence[Score]) -> None:
@@ -157,14 +246,17 @@ def summary(scores: Sequence[Score], *, frames: int, size_bytes: int, borders: S
     """Means over the frames, per camera and over all, the size of the scene file, and how much segment borders show.
 
     `borders` are the first frames of segments. `seam` is their flicker over that of all other frames; 1 is seamless.
+    Trends are in dB per 100 frames; that of all cameras is the mean of theirs.
     """
     names = list(dict.fromkeys(item.camera for item in scores))
+    by_camera = {name: _facts([item for item in scores if item.camera == name]) for name in names}
+    trends = {name: _mean([facts[name] for facts in by_camera.values()]) for name in TRENDS}
     return {
         "frames": frames,
         "cameras": names,
         "held_out": all(item.held_out for item in scores),
-        "mean": _means(scores),
-        "by_camera": {name: _means([item for item in scores if item.camera == name]) for name in names},
+        "mean": _means(scores) | trends,
+        "by_camera": by_camera,
         "seam": _seam(scores, set(borders)),
         "bytes": size_bytes,
         "bytes_per_frame": size_bytes / frames,
@@ -176,6 +268,16 @@ def _seam(scores: Sequence[Score], borders: set[int]) -> float | None:
     at_border = _mean([item.flicker for item in scores if item.frame in borders])
     inside = _mean([item.flicker for item in scores if item.frame not in borders])
     return at_border / inside if at_border is not None and inside else None
+
+
+def _facts(scores: Sequence[Score]) -> dict[str, float | None]:
+    """Of one camera: means, and trends."""
+    return _means(scores) | {name: _trend(scores, level) for name, level in TRENDS.items()}
+
+
+def _trend(scores: Sequence[Score], name: str) -> float | None:
+    known = [(item.frame, level) for item in scores if (level := getattr(item, name)) is not None]
+    return trend([frame for frame, _ in known], [level for _, level in known])
 
 
 def _means(scores: Sequence[Score]) -> dict[str, float | None]:

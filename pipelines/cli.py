@@ -451,6 +451,12 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--cameras", type=_names, default=None, metavar="a,b", help="cameras (those held out, or three)"
     )
+    command.add_argument(
+        "--lpips-weights",
+        default=None,
+        metavar="FILE",
+        help="torchvision's AlexNet or VGG-16 weights, to measure LPIPS",
+    )
     _json(command)
 
 

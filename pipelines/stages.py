@@ -8,7 +8,9 @@ would keep that worker from working.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+from packuv.lpips import lacking
 from pipelines.chain import Chain, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
@@ -167,4 +169,14 @@ class Sequence:
             why = f"no camera is held out; scored on fitted {', '.join(cameras)}"
             self.workshop.listener.skipped("unseen scores", why)
         take = replace(self._take("points"), cameras=cameras, stop=None)
-        self._make(Evaluate(take=take, scene=self.made.only("encode")))
+        self._make(self._evaluation(take))
+
+    def _evaluation(self, take: Take) -> Evaluate:
+        """With LPIPS, where the file of weights and the package for it are there."""
+        scene, named = self.made.only("encode"), self.options.evaluate.lpips_weights
+        weights = Path(named).resolve() if named else None
+        why = lacking(weights)
+        if why or weights is None:
+            return Evaluate(take=take, scene=scene, no_lpips=why)
+        backbone = self.workshop.files({"backbone": weights}, "evaluate")
+        return Evaluate(take=take, scene=scene, backbone=backbone, weights=str(weights))

@@ -69,10 +69,9 @@ class Guard:
     def _inspect(self, model: Model, gradients: Mapping[str, np.ndarray] | None, rows: np.ndarray) -> np.ndarray:
         """int8 [N]: 0 for a row in order, else 1 + the place of the attribute, plus 5 if its gradient is at fault."""
         count = len(model)
-        flat = {name: getattr(model.gaussians, name) for name in ATTRIBUTES}
-    flat = {name: values.reshape(count, math.prod(values.shape[1:])) for name, values in flat.items()}
-        slopes = flat if gradients is None else {name: gradients[name].reshape(count, -1) for name in ATTRIBUTES}
-        good = [getattr(self._good, name).reshape(count, -1) for name in ATTRIBUTES]
+        flat = {name: _flat(getattr(model.gaussians, name)) for name in ATTRIBUTES}
+        slopes = flat if gradients is None else {name: _flat(gradients[name]) for name in ATTRIBUTES}
+        good = [_flat(getattr(self._good, name)) for name in ATTRIBUTES]
         faults = np.zeros(count, np.int8)
         prefer_tbb()
         _inspect(*flat.values(), *(slopes[name] for name in ATTRIBUTES), *good, gradients is not None,
@@ -99,6 +98,11 @@ def _worst(values: np.ndarray) -> float:
     flat = np.atleast_1d(values).ravel()
     broken = flat[~np.isfinite(flat)]
     return float(broken[0] if len(broken) else flat[np.abs(flat).argmax()])
+
+
+def _flat(values: np.ndarray) -> np.ndarray:
+    """[N, ...] as [N, the rest], also for no rows."""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 @kernel(inline=True)

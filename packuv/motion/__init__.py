@@ -2,12 +2,15 @@
 
 from packuv.motion.background import BackgroundOptions, Still, find_background, load_stills, save_stills
 from packuv.motion.cache import MotionCache, measure_motion
+from packuv.motion.follow import Change, Follower
 from packuv.motion.keyframes import KeyframeOptions
 from packuv.motion.plate import Plate, compare_plate
 from packuv.motion.step import MotionOptions, changed_between
 
 __all__ = [
     "BackgroundOptions",
+    "Change",
+    "Follower",
     "KeyframeOptions",
     "MotionCache",
     "MotionOptions",

@@ -179,25 +179,44 @@ def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
 
 
 def evaluate(arguments: argparse.Namespace) -> int:
-    """`packuv eval`: PSNR and SSIM of every frame against what cameras filmed."""
+    """`packuv eval`: every frame against what cameras filmed, by the definitions of docs/scores.md."""
     from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
 
+    options = EvaluateOptions(lpips_weights=arguments.lpips_weights)
     with shown(arguments, "evaluate") as progress:
-        facts = evaluate_scene(
-            arguments.scene, arguments.capture, arguments.cameras, EvaluateOptions(), progress=progress
-        )
+        facts = evaluate_scene(arguments.scene, arguments.capture, arguments.cameras, options, progress=progress)
     print_facts(facts, arguments.json, _scores_text)
     return 0
 
 
 def _scores_text(facts: Mapping[str, Any]) -> str:
+    rows = {**facts["by_camera"], "mean": facts["mean"]}
     kinds = {"_calibrated": "calibrated", "": "raw", "_own": "own gain"}
     lines = [f"{'camera':<12}" + "".join(f"{text:>22}" for text in kinds.values())]
-    for name, means in {**facts["by_camera"], "mean": facts["mean"]}.items():
+    for name, means in rows.items():
         lines.append(f"{name:<12}" + "".join(f"{_score_text(means, kind):>22}" for kind in kinds))
+    lines += ["", f"{'calibrated':<12}" + "".join(f"{text:>16}" for text in _APART)]
+    for name, means in rows.items():
+        lines.append(f"{name:<12}" + "".join(f"{_figure(means[key], how):>16}" for key, how in _APART.values()))
     what = "held out, never fitted" if facts["held_out"] else "not all held out"
     lines.append(f"{facts['frames']} frames, {size_text(facts['bytes_per_frame'])} a frame; cameras {what}")
     return "\n".join(lines)
+
+
+_APART = {
+    "moving dB": ("psnr_moving_db", ".2f"),
+    "still dB": ("psnr_still_db", ".2f"),
+    "never moving dB": ("psnr_never_moving_db", ".2f"),
+    "still, trend": ("still_trend_db", "+.2f"),
+    "tOF px": ("tof_px", ".3f"),
+    "flicker": ("flicker", ".4f"),
+    "LPIPS": ("lpips", ".4f"),
+}
+"""Heads of columns: the figure, and its form"""
+
+
+def _figure(value: float | None, how: str) -> str:
+    return "-" if value is None else format(value, how)
 
 
 def _score_text(means: Mapping[str, float | None], kind: str) -> str:

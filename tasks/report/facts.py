@@ -17,6 +17,7 @@ import numpy as np
 
 from calibration.accept import RigReport
 from calibration.rig import Rig
+from packuv.metrics import trend
 from packuv.scene import Scene
 from packuv.scene.stream import REPEAT
 from sync.align import SyncReport
@@ -76,7 +77,22 @@ class FrameScore:
     frame: int
     """Frame of the scene, from 0"""
     psnr_db: float
+    """Of the render as the camera would film it, as are all but `raw_db` and `own_db`"""
     ssim: float
+    raw_db: float | None = None
+    """Of the render in the rig's colours"""
+    own_db: float | None = None
+    """With the one gain per channel that fits this picture best"""
+    moving_db: float | None = None
+    """Where the filmed picture moved; None where nothing did, as below"""
+    still_db: float | None = None
+    """Everywhere else"""
+    never_moving_db: float | None = None
+    """Where nothing moves in any frame"""
+    tof_px: float | None = None
+    """Difference of motion, pixels"""
+    flicker: float | None = None
+    lpips: float | None = None
 
     @property
     def level_db(self) -> float:
@@ -207,9 +223,37 @@ def by_camera(scores: Sequence[FrameScore]) -> dict[str, list[FrameScore]]:
     return cameras
 
 
-def mean_by_frame(scores: Sequence[FrameScore]) -> dict[int, float]:
-    """Mean ratio of the cameras at each frame, dB, in order of frames."""
-    frames: dict[int, list[float]] = {}
+def mean_by_frame(scores: Sequence[FrameScore], name: str = "psnr_db") -> dict[int, float]:
+    """Mean ratio of the cameras that have it at each frame, dB, in order of frames."""
+    frames: dict[int, list[FrameScore]] = {}
     for score in sorted(scores, key=lambda item: item.frame):
-        frames.setdefault(score.frame, []).append(score.level_db)
-    return {frame: float(np.mean(levels)) for frame, levels in frames.items()}
+        frames.setdefault(score.frame, []).append(score)
+    means = {frame: mean_of(own, name) for frame, own in frames.items()}
+    return {frame: level for frame, level in means.items() if level is not None}
+
+
+LEVELS = {
+    "raw_db": "raw",
+    "psnr_db": "calibrated",
+    "own_db": "own gain",
+    "moving_db": "moving",
+    "still_db": "still",
+    "never_moving_db": "never moving",
+}
+"""Ratios that a score holds, dB, and what people call them"""
+
+
+def mean_of(scores: Sequence[FrameScore], name: str) -> float | None:
+    """Mean of a figure over the scores that have it; ratios of equal pictures count as `MAX_PSNR_DB`."""
+    known = [value for score in scores if (value := getattr(score, name)) is not None]
+    return float(np.mean(np.minimum(known, MAX_PSNR_DB) if name in LEVELS else known)) if known else None
+
+
+def still_trend(scores: Sequence[FrameScore]) -> float | None:
+    """Course of what is still, dB per 100 frames: the mean of the cameras' slopes; None for too few frames."""
+    slopes = []
+    for own in by_camera(scores).values():
+        known = [(score.frame, score.still_db) for score in own if score.still_db is not None]
+        slopes.append(trend([frame for frame, _ in known], [level for _, level in known]))
+    found = [slope for slope in slopes if slope is not None]
+    return float(np.mean(found)) if found else None

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.report.facts import ReportInput, StageOutcome, by_camera, mean_by_frame
+from tasks.report.facts import ReportInput, StageOutcome, by_camera, mean_by_frame, still_trend
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class Limits:
     """A frame whose mean is this far below the median frame: motion that the fit could not follow"""
     poor_db: float = 20.0
     """A mean held-out ratio below this shows at a glance"""
+    still_fall_db: float = 0.3
+    """A greater fall of still areas in 100 frames: frames explain light and shadow in ways that other cameras refute"""
     dynamic_share: float = 0.5
     """More dynamic Gaussians than this: noise passes for motion, and every frame pays for it"""
 
@@ -124,6 +126,9 @@ def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
         worst = min(low, key=lambda frame: frames[frame])
         text = f"{len(low)} of {len(frames)} frames score {limits.frame_drop_db:g} dB or more below the median frame"
         yield Finding("quality", f"{text}, the worst being frame {worst} with {frames[worst]:.1f} dB.")
+    slope = still_trend(report.scores)
+    if slope is not None and slope < -limits.still_fall_db:
+        yield Finding("quality", f"Still places rot: they lose {-slope:.2f} dB per 100 frames.")
     overall = float(np.mean(list(cameras.values())))
     if overall < limits.poor_db:
         yield Finding("quality", f"The mean of {overall:.1f} dB is poor: the difference shows at a glance.")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from tasks.artefacts.recipe import plain
-from tasks.report.facts import ReportInput, by_camera
+from tasks.report.facts import LEVELS, MAX_PSNR_DB, FrameScore, ReportInput, by_camera, mean_of, still_trend
 from tasks.report.findings import LIMITS, Limits, findings
 
 SCHEMA = 1
@@ -39,14 +39,16 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
             "magnitude_px": [float(v) if math.isfinite(v) else None for v in report.motion.magnitude_px],
             "keyframes": list(report.motion.keyframes),
         },
-        "scores": [
-            {"camera": score.camera, "frame": score.frame, "psnr_db": score.level_db, "ssim": score.ssim}
-            for score in report.scores
-        ],
+        "scores": [_score_json(score) for score in report.scores],
         "scene": report.scene and {**plain(report.scene), "mb_per_30_frames": report.scene.mb_per_30_frames},
         "pictures": [{"camera": c.camera, "frame": c.frame, "choice": c.choice} for c in report.pictures],
         "stages": [plain(stage) for stage in report.stages],
     }
+
+
+def _score_json(score: FrameScore) -> dict[str, Any]:
+    levels = {name: min(value, MAX_PSNR_DB) for name in LEVELS if (value := getattr(score, name)) is not None}
+    return {**vars(score), **levels}
 
 
 def summary(report: ReportInput) -> dict[str, Any]:
@@ -57,6 +59,9 @@ def summary(report: ReportInput) -> dict[str, Any]:
     return {
         "psnr_db": _mean([np.mean([score.level_db for score in own]) for own in cameras.values()]),
         "ssim": _mean([np.mean([score.ssim for score in own]) for own in cameras.values()]),
+        **{f"psnr_{name}": _over_cameras(cameras, name) for name in LEVELS if name != "psnr_db"},
+        "still_trend_db": still_trend(report.scores),
+        **{name: _over_cameras(cameras, name) for name in ("tof_px", "flicker", "lpips")},
         "scored_cameras": sorted(cameras),
         "mb_per_30_frames": scene.mb_per_30_frames if scene else None,
         "seconds": report.seconds if report.seconds is not None else work,
@@ -66,6 +71,10 @@ def summary(report: ReportInput) -> dict[str, Any]:
         "held_out": list(report.held_out),
         "verified": scene.verified if scene else None,
     }
+
+
+def _over_cameras(cameras: Mapping[str, Sequence[FrameScore]], name: str) -> float | None:
+    return _mean([value for own in cameras.values() if (value := mean_of(own, name)) is not None])
 
 
 def _mean(values: Sequence[Any]) -> float | None:

@@ -8,10 +8,21 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from sync.align import CameraReport, SyncReport
 from tasks.artefacts.recipe import plain
-from tasks.report.facts import FrameScore, ReportInput, StageOutcome, StageRecord, by_camera, mean_by_frame
+from tasks.report.facts import (
+    LEVELS,
+    FrameScore,
+    ReportInput,
+    StageOutcome,
+    StageRecord,
+    by_camera,
+    mean_by_frame,
+    mean_of,
+    still_trend,
+)
 from tasks.report.findings import Finding, Limits
 from tasks.report.pictures import DIFFERENCE_GAIN, comparison
 from tasks.report.plots import Series, Volume, bar_chart, gain_chart, line_chart, rig_views, sparkline
@@ -178,8 +189,24 @@ def _quality(report: ReportInput, limits: Limits) -> Body:
             marks=report.motion.keyframes if report.motion else (),
             height=300,
         ),
-        "cameras": [_score_row(name, own, level[name], low) for name, own in cameras.items()],
+        "cameras": [_score_row(name, own, level[name], low, limits) for name, own in cameras.items()],
+        "kinds": list(LEVELS.values()),
+        "areas": _areas(report),
+        "trend_db": still_trend(report.scores),
     }
+
+
+def _areas(report: ReportInput) -> Markup | None:
+    """Moving and still areas over time, means over the cameras."""
+    named = {name: LEVELS[name] for name in ("moving_db", "still_db", "never_moving_db")}
+    lines = []
+    for number, (name, text) in enumerate(named.items(), start=1):
+        means = mean_by_frame(report.scores, name)
+        if means:
+            lines.append(Series(text, list(means), list(means.values()), f"s{number}"))
+    if not lines:
+        return None
+    return line_chart(lines, title="Moving and still areas", x_label="frame", y_label="PSNR, dB", height=260)
 
 
 def _level_lines(
@@ -199,7 +226,8 @@ def _level_lines(
     return lines
 
 
-def _score_row(camera: str, own: Sequence[FrameScore], mean_db: float, low: float) -> View:
+def _score_row(camera: str, own: Sequence[FrameScore], mean_db: float, low: float, limits: Limits) -> View:
+    slope = still_trend(own)
     worst = min(own, key=lambda score: score.level_db)
     return {
         "camera": camera,
@@ -208,6 +236,10 @@ def _score_row(camera: str, own: Sequence[FrameScore], mean_db: float, low: floa
         "worst_db": worst.level_db,
         "worst_frame": worst.frame,
         "ssim": float(np.mean([score.ssim for score in own])),
+        "levels": [mean_of(own, name) for name in LEVELS],
+        "trend_db": slope,
+        "falls": slope is not None and slope < -limits.still_fall_db,
+        **{name: mean_of(own, name) for name in ("tof_px", "flicker", "lpips")},
         "pictures": len(own),
     }
 

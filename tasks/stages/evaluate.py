@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from packuv.bounds import MOST_CAMERAS, MOST_NS, MOST_SIDE_PX, field, items, whole
 from packuv.files import save_json
 from packuv.footage import LensCamera, Transfer, Views
+from packuv.lpips import Lpips, lacking
 from packuv.progress import Progress
 from packuv.scene import open_scene
 from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
@@ -20,7 +22,7 @@ from sync.align import AlignOptions, FrameGroups, align
 from sync.capture import find_capture, load_timecodes
 from sync.clock import ClockMode
 from sync.probe import probe_video
-from tasks.artefacts.stage import Notes, Stage, Work
+from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.report.facts import FrameScore, frames_to_picture
 from tasks.stages.encode import SCENE
@@ -36,6 +38,8 @@ class EvaluateOptions:
 
     fitted_cameras: int = 3
     """Fitted cameras to score, spread over the rig, where no camera is held out"""
+    lpips_weights: str | None = None
+    """File of torchvision's AlexNet or VGG-16 weights, a state dict, to measure LPIPS with; nothing is downloaded"""
 
     def __post_init__(self) -> None:
         if self.fitted_cameras < 1:
@@ -46,20 +50,32 @@ class EvaluateOptions:
 class Evaluate(Stage):
     """Score every frame of the scene file on the cameras of a take: metrics.json, metrics.arrow, pictures/."""
 
-    name, version = "evaluate", 3
+    name, version = "evaluate", 4
     take: Take
     scene: Key
+    backbone: Files | None = None
+    """Digest of the file at `weights`; None where LPIPS is not measured"""
+    weights: str = dataclasses.field(default="", compare=False)
+    """Path of the backbone's weights"""
+    no_lpips: str = dataclasses.field(default="", compare=False)
+    """Why LPIPS is not measured"""
 
     def build(self, work: Work) -> Notes:
         views, scene = Footage(self.take, work.site).open_views(), work.path(self.scene) / SCENE
+        lpips = Lpips(Path(self.weights)) if self.backbone else None
         with open_scene(scene) as opened:
-            scores = score(opened, views, work.progress)
+            scores = score(opened, views, work.progress, lpips=lpips)
             write_table(work.out / TABLE, scores)
             write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
             borders = segment_starts(opened)
             facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=borders)
         save_json(work.out / METRICS, facts)
-        return {name: facts[name] for name in ("cameras", "held_out", "mean")}
+        notes = {name: facts[name] for name in ("cameras", "held_out", "mean")}
+        return {**notes, "no_lpips": self.no_lpips} if self.no_lpips else notes
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        if "no_lpips" in notes:
+            yield "LPIPS", notes["no_lpips"]
 
 
 def scored_cameras(plan: Plan, options: EvaluateOptions) -> tuple[str, ...]:
@@ -73,8 +89,12 @@ def evaluate_scene(
     """Score a scene file against a capture folder, without a store; the summary that `evaluate` writes.
 
     The frames of the capture are matched again as the scene's header says, and found by their times. Raises
-    ValueError for a camera that the scene does not know, or a capture that did not film the scene's instants.
+    ValueError for a camera that the scene does not know, or a capture that did not film the scene's instants; where
+    weights for LPIPS are named, but it cannot be measured with them.
     """
+    weights = Path(options.lpips_weights) if options.lpips_weights else None
+    if weights and (why := lacking(weights)):
+        raise ValueError(why)
     with open_scene(scene) as opened:
         header = opened.header
         lenses = _lenses(header.extra)
@@ -94,7 +114,7 @@ def evaluate_scene(
             max_width=_max_width(header.extra),
             transfer=Transfer(said) if said else None,
         )
-        scores = score(opened, views, progress)
+        scores = score(opened, views, progress, lpips=Lpips(weights) if weights else None)
         return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
 
 
@@ -129,13 +149,26 @@ def _rows(groups: FrameGroups, times_ns: np.ndarray) -> np.ndarray:
 
 
 def frame_scores(scores: Sequence[Score]) -> tuple[FrameScore, ...]:
-    """Scores of renders as the cameras would film them, as the report shows them."""
+    """Scores as the report shows them; the ratio and SSIM are those of renders as the cameras would film them."""
     return tuple(
         FrameScore(
             item.camera,
             item.frame,
-            math.inf if item.psnr_calibrated_db is None else item.psnr_calibrated_db,
+            _level(item.psnr_calibrated_db),
             item.ssim_calibrated,
+            raw_db=_level(item.psnr_db),
+            own_db=_level(item.psnr_own_db),
+            moving_db=item.psnr_moving_db,
+            still_db=item.psnr_still_db,
+            never_moving_db=item.psnr_never_moving_db,
+            tof_px=item.tof_px,
+            flicker=item.flicker,
+            lpips=item.lpips,
         )
         for item in scores
     )
+
+
+def _level(decibel: float | None) -> float:
+    """Equal pictures have an infinite ratio."""
+    return math.inf if decibel is None else decibel

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from packuv.metrics import psnr, ssim
+from packuv.metrics import LEAST_FRAMES, psnr, ssim, trend
 
 
 def plain_ssim(a: np.ndarray, b: np.ndarray) -> float:
@@ -73,3 +76,35 @@ def test_wrong_input_is_refused_with_what_came():
         psnr(a, b[0])
     with pytest.raises(ValueError, match="at least 11 pixels a side"):
         ssim(a[:, :10], b[:, :10])
+
+
+# ---- against scikit-image, with the settings of the field
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.3])
+@pytest.mark.parametrize("shape", [(37, 53), (3, 40, 61)])
+def test_as_scikit_image_has_it(shape, noise):
+    a, b = (plane.astype(np.float64) for plane in pictures(shape, noise))
+    channel = 0 if len(shape) == 3 else None
+    wanted = structural_similarity(
+        a, b, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=channel
+    )
+    assert ssim(a, b) == pytest.approx(wanted, abs=1e-9)  # sums in another order
+    assert psnr(a, b) == pytest.approx(peak_signal_noise_ratio(b, a, data_range=1), abs=1e-9)
+
+
+# ---- course over time
+
+
+@given(st.floats(-5, 5), st.floats(10, 40), st.integers(LEAST_FRAMES, 300), st.integers(0, 1000))
+def test_the_trend_of_a_line_is_its_slope_whatever_its_level_and_its_start(slope, level, count, start):
+    frames = range(start, start + count)
+    levels = [level + slope * (frame - start) / 100 for frame in frames]
+    # Float64, and levels of tens of dB.
+    assert trend(frames, levels) == pytest.approx(slope, abs=1e-9)
+    assert trend(frames, levels[::-1]) == pytest.approx(-slope, abs=1e-9)
+
+
+def test_few_frames_have_no_trend():
+    assert trend(range(LEAST_FRAMES - 1), [30.0] * (LEAST_FRAMES - 1)) is None
+    assert trend([], []) is None

@@ -16,9 +16,10 @@ from packuv.footage import LensCamera, Views
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Quantizer, attribute_values
 from packuv.gaussians.floats import with_canonical_axes
 from packuv.gaussians.segment import Segment
+from packuv.metrics import psnr
 from packuv.progress import no_progress
 from packuv.scene import SceneHeader, open_scene, write_scene
-from packuv.score import FIGURES, SCHEMA, Artist, Score, score
+from packuv.score import BLOCKS, FIGURES, SCHEMA, Artist, Score, _Watch, score
 from tests.support.splats import wall
 
 
@@ -36,13 +37,19 @@ def test_the_table_has_the_columns_that_stores_hold():
             ("psnr_own_db", pa.float64()),
             ("ssim_own", pa.float64()),
             ("flicker", pa.float64()),
+            ("psnr_moving_db", pa.float64()),
+            ("psnr_still_db", pa.float64()),
+            ("moving_share", pa.float64()),
+            ("tof_px", pa.float64()),
+            ("lpips", pa.float64()),
+            ("psnr_never_moving_db", pa.float64()),
         ]
     ).equals(SCHEMA, check_metadata=True)
 
 
 def test_every_field_is_a_column_and_every_figure_has_a_mean():
     assert SCHEMA.names == [field.name for field in fields(Score)]
-    assert FIGURES == ("psnr_db", "ssim", "psnr_calibrated_db", "ssim_calibrated", "psnr_own_db", "ssim_own", "flicker")
+    assert tuple(name for name in SCHEMA.names if name not in ("frame", "time_ns", "camera", "held_out")) == FIGURES
 
 
 # In light that changes
@@ -97,3 +104,72 @@ def test_raw_scores_are_those_of_the_scene_in_its_light(tmp_path):
     raw = [one.psnr_db for one in scores_of(steady, tmp_path / "a.mp4", LIGHT[:, None])]
     assert raw[0] > 55
     assert max(raw[1:]) < 30
+
+
+# ---- moving and still areas
+
+HEIGHT, WIDTH = 90, 160
+RNG = np.random.default_rng(2)
+WALL = RNG.integers(60, 200, (HEIGHT // 10, WIDTH // 10, 3)).repeat(10, 0).repeat(10, 1).astype(np.uint8)
+
+
+SQUARE = RNG.integers(0, 256, (10, 10, 3)).repeat(3, 0).repeat(3, 1).astype(np.uint8)
+
+
+def filmed(x: int) -> np.ndarray:
+    """A square at column x before a wall, uint8 [H, W, 3]."""
+    picture = WALL.copy()
+    picture[30:60, x : x + 30] = SQUARE
+    return picture
+
+
+def watch(errors: list[np.ndarray]) -> tuple[_Watch, list[tuple[float | None, ...]]]:
+    """What is seen of a square that goes right by 5 pixels a frame, with these errors of the render."""
+    seen = _Watch()
+    return seen, [seen.see(filmed(20 + 5 * i), filmed(20 + 5 * i), error) for i, error in enumerate(errors)]
+
+
+def flat(size: float) -> np.ndarray:
+    return np.full((3, HEIGHT, WIDTH), size, np.float32)
+
+
+def test_an_equal_error_is_equal_in_all_areas():
+    seen, areas = watch([flat(0.1)] * 3)
+    assert areas[0] == (None, None, None, None)
+    for moving, still, share, tof in areas[1:]:
+        assert moving == pytest.approx(20, abs=1e-4)
+        assert still == pytest.approx(20, abs=1e-4)
+        assert 0 < share < 0.3
+        assert tof == 0
+    assert list(seen.never_moving()) == pytest.approx([20] * 3, abs=1e-4)
+
+
+def test_areas_are_apart_and_make_up_the_picture():
+    error = RNG.normal(0, 0.1, (3, HEIGHT, WIDTH)).astype(np.float32)
+    _, areas = watch([error, error])
+    moving, still, share, _ = areas[1]
+    mean = share * 10 ** (-moving / 10) + (1 - share) * 10 ** (-still / 10)
+    # Float32 squares.
+    assert -10 * np.log10(mean) == pytest.approx(
+        psnr(np.full_like(error, 0.5) + error, np.full_like(error, 0.5)), abs=1e-3
+    )
+
+
+def test_errors_where_the_square_passes_at_any_time_do_not_count_as_never_moving():
+    error = flat(0.01)
+    error[:, 30:60, 20:65] = 0.5  # its way over all frames
+    seen, _ = watch([error] * 4)
+    assert list(seen.never_moving()) == pytest.approx([40] * 4, abs=1e-3)
+
+
+def test_a_scene_of_one_frame_and_an_exact_one_have_no_areas():
+    seen, _ = watch([flat(0.1)])
+    assert list(seen.never_moving()) == [None]
+    seen, areas = watch([flat(0)] * 2)
+    assert areas[1][:2] == (None, None)
+    assert list(seen.never_moving()) == [None, None]
+
+
+def test_what_is_kept_of_a_picture_is_small():
+    seen, _ = watch([flat(0.1)])
+    assert seen.blocks[0].shape == (round(BLOCKS * HEIGHT / WIDTH), BLOCKS)

@@ -323,6 +323,32 @@ def test_bad_colours_scores_files_and_stages_are_named() -> None:
     ]
 
 
+def falling(slope_db: float, frames: int = 60) -> tuple[FrameScore, ...]:
+    """Scores whose still areas change by this much in 100 frames."""
+    return tuple(
+        FrameScore(camera, frame, 26.0, 0.9, moving_db=22.0, still_db=28.0 + slope_db * frame / 100, tof_px=0.2)
+        for camera in HELD_OUT
+        for frame in range(frames)
+    )
+
+
+def test_still_places_that_rot_are_named() -> None:
+    report = replace(make_report(), motion=None, scores=falling(-0.5))
+    assert texts(report) == ["quality: Still places rot: they lose 0.50 dB per 100 frames."]
+    assert summary(report)["still_trend_db"] == pytest.approx(-0.5)
+    words = Page(page_text(report)).words
+    assert "Where the error lies" in words
+    assert "-0.50 over all" in words
+    for scores in (falling(-0.25), falling(0.5), falling(-2.0, frames=20)):
+        assert texts(replace(report, scores=scores)) == []
+
+
+def test_scores_without_areas_show_none() -> None:
+    report = make_report()
+    assert "Where the error lies" not in Page(page_text(report)).words
+    assert summary(report)["psnr_moving_db"] is None
+
+
 def test_cameras_that_code_colour_otherwise_and_log_footage_are_named() -> None:
     usual = {"bit_depth": 10, "transfer": "bt709"}
     colours = {"cam0": usual, "cam1": {"bit_depth": 8, "transfer": None}, "cam2": usual}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,12 @@ from hypothesis import strategies as st
 from packuv.colour import linear_from_srgb, srgb_from_linear
 from packuv.metrics import psnr
 from packuv.score import Score, read_table, spread, summary, with_own_gain, write_table
+from tasks.artefacts.stage import Files
+from tasks.artefacts.store import Key
+from tasks.report.facts import still_trend
 from tasks.stages import evaluate
-from tasks.stages.evaluate import frame_scores
+from tasks.stages.evaluate import Evaluate, frame_scores
+from tasks.stages.footage import Take
 
 RNG = np.random.default_rng(5)
 SCENE = RNG.uniform(0.05, 0.7, (3, 24, 32)).astype(np.float32)
@@ -41,10 +46,27 @@ def test_own_gain_does_not_explain_structure():
 FLICKER = (None, 0.01, 0.03)
 
 
-def scores() -> list[Score]:
+def scores(frames: int = 3) -> list[Score]:
     return [
-        Score(frame, frame * 33_000_000, camera, True, 20.0 + frame, 0.5, level, 0.6, 22.0, 0.7, FLICKER[frame])
-        for frame in range(3)
+        Score(
+            frame,
+            frame * 33_000_000,
+            camera,
+            True,
+            20.0 + frame,
+            0.5,
+            level,
+            0.6,
+            22.0,
+            0.7,
+            FLICKER[frame % 3],
+            psnr_moving_db=19.0,
+            psnr_still_db=30.0 - 0.01 * frame,
+            moving_share=0.25,
+            tof_px=0.5,
+            lpips=None,
+        )
+        for frame in range(frames)
         for camera, level in (("cam05", 24.0), ("cam14", None))
     ]
 
@@ -64,6 +86,29 @@ def test_exact_pictures_count_as_infinite_in_the_report_and_not_at_all_in_means(
     assert facts["bytes_per_frame"] == 1000
     assert facts["seam"] == pytest.approx(3.0)
     assert summary(scores(), frames=3, size_bytes=3000, borders=[])["seam"] is None
+
+
+def test_trends_are_told_by_camera_and_over_all_where_there_are_frames_enough():
+    facts = summary(scores(60), frames=60, size_bytes=1, borders=[])
+    for means in (facts["mean"], facts["by_camera"]["cam05"], facts["by_camera"]["cam14"]):
+        assert means["still_trend_db"] == pytest.approx(-1.0)
+        assert means["never_moving_trend_db"] is None
+    assert summary(scores(), frames=3, size_bytes=1, borders=[])["mean"]["still_trend_db"] is None
+    assert still_trend(frame_scores(scores(60))) == pytest.approx(-1.0)
+
+
+def test_the_content_of_the_weights_decides_what_is_scored_anew_not_their_place():
+    take = Take(groups=Key("sync", "0" * 64), cameras=("cam05",))
+
+    def recipe(**lpips: Any) -> Any:
+        stage = Evaluate(take=take, scene=Key("encode", "0" * 64), **lpips)
+        return stage.sources, stage.settings
+
+    here = recipe(backbone=Files({"backbone": "1" * 64}), weights="/here/alexnet.pth")
+    assert here == recipe(backbone=Files({"backbone": "1" * 64}), weights="/there/alexnet.pth")
+    assert here != recipe(backbone=Files({"backbone": "2" * 64}), weights="/here/alexnet.pth")
+    assert here != recipe(no_lpips="no file")
+    assert recipe(no_lpips="no file") == recipe(no_lpips="no package")
 
 
 @given(st.lists(st.text(min_size=1, max_size=3), unique=True, max_size=40), st.integers(1, 8))
