@@ -6,7 +6,7 @@ import json
 import shlex
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -137,7 +137,8 @@ def collect(run: Run) -> ReportInput:
         held_out=run.plan.held_out,
         check=_check(run),
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
-        log_like=_log_like(run),
+        unlike=_points_notes(run).get("unlike", {}),
+        log_like=tuple(_points_notes(run).get("log_like", ())),
         motion=_curve(run.folder("keyframes")),
         scores=_scores(run.folder("evaluate")),
         scene=_scene(run),
@@ -155,9 +156,9 @@ def _check(run: Run) -> RigReport | None:
     return replace(report, suspicious={**report.suspicious, **refused})
 
 
-def _log_like(run: Run) -> tuple[str, ...]:
+def _points_notes(run: Run) -> Mapping[str, Any]:
     points = run.made.get("points")
-    return tuple(run.workshop.store.receipt(points).notes["log_like"]) if points else ()
+    return run.workshop.store.receipt(points).notes if points else {}
 
 
 def _curve(folder: Path | None) -> MotionCurve | None:

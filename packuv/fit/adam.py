@@ -51,7 +51,7 @@ class AdamState:
     @classmethod
     def zeros(cls, parameters: np.ndarray) -> AdamState:
         """Fresh state for an array [N, ...]."""
-        shape = (len(parameters), parameters[0:1].size)
+        shape = (len(parameters), math.prod(parameters.shape[1:]))
         return cls(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(len(parameters), np.int32))
 
     def __len__(self) -> int:
@@ -81,7 +81,7 @@ def adam_step(
     Raises ValueError if shapes or types do not fit.
     """
     count = len(parameters)
-    columns = parameters[0:1].size
+    columns = math.prod(parameters.shape[1:])
     if gradient.shape != parameters.shape or state.first.shape != (count, columns):
         raise ValueError(f"{parameters.shape=} {gradient.shape=} {state.first.shape=} do not belong together")
     for name, array in (("parameters", parameters), ("gradient", gradient)):

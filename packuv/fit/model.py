@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -52,7 +53,7 @@ class Model:
         """One step of Adam for the rows, bool [N]; the other rows keep values and moments bit for bit."""
         for name in ATTRIBUTES:
             values, gradient = getattr(self.gaussians, name), gradients[name]
-            width = values[0:1].size
+            width = math.prod(values.shape[1:])
             adam_step(values, gradient, self.moments[name], rows=rows,
                       rate=rates.columns(name, width, radius=radius, progress=progress))  # fmt: skip
 

@@ -167,12 +167,14 @@ class ReportInput:
     """Time from start to end of the run; without it the sum of the stages is shown"""
     sync: SyncReport | None = None
     rig: Rig | None = None
-    """All cameras, held-out ones too, with their gains"""
+    """All cameras, held-out ones too, with their gains and shading"""
     held_out: tuple[str, ...] = ()
     """Cameras that were never fitted"""
     check: RigReport | None = None
     colours: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """By camera: how its video says that it codes colour, see `sync.probe.ColourTags`"""
+    unlike: Mapping[str, str] = field(default_factory=dict)
+    """Cameras that were not balanced although others were, and why"""
     log_like: tuple[str, ...] = ()
     """Cameras whose pictures look like log footage that nobody called so"""
     motion: MotionCurve | None = None

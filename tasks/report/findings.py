@@ -24,6 +24,9 @@ class Limits:
     """95th percentile of the residuals, in frame periods: beyond it, moving things sit visibly elsewhere"""
     gain: float = 1.25
     """A colour gain above this, or below its inverse, is exposure that differs or a camera that sees little"""
+    corner: tuple[float, float] = (0.5, 1.1)
+    """Light in the corner as a share of that in the middle, least and most: beyond it hardly a lens, rather points that
+    say too little, or light that the scene itself lacks there"""
     camera_drop_db: float = 6.0
     """A camera this far below the median camera is calibrated, synchronized or balanced worse than the others"""
     frame_drop_db: float = 3.0
@@ -34,6 +37,10 @@ class Limits:
     """A greater fall of still areas in 100 frames: frames explain light and shadow in ways that other cameras refute"""
     dynamic_share: float = 0.5
     """More dynamic Gaussians than this: noise passes for motion, and every frame pays for it"""
+
+    def odd_corner(self, light: float) -> bool:
+        """Whether this share of light in the corner is beyond the limits."""
+        return not self.corner[0] <= light <= self.corner[1]
 
 
 LIMITS = Limits()
@@ -87,6 +94,16 @@ def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
         worst = max(camera.gains, key=lambda gain: abs(math.log(gain)))
         if not 1 / limits.gain <= worst <= limits.gain:
             yield Finding("colour", f"{camera.name} needs a colour gain of {worst:.2f}.")
+        light = float(corner_light(np.array(camera.shading)))
+        if limits.odd_corner(light):
+            yield Finding("colour", f"{camera.name} seems to have {light:.0%} of its light in the corner.")
+    yield from (Finding("colour", f"{name} keeps its colours as filmed: {why}.") for name, why in report.unlike.items())
+
+
+def corner_light(shading: np.ndarray) -> np.ndarray:
+    """Light in a picture's corner as a share of that in its middle, [...] of k1, k2 [..., 2]."""
+    light: np.ndarray = np.exp(shading.sum(axis=-1))
+    return light
 
 
 def _colour_findings(report: ReportInput) -> Iterator[Finding]:

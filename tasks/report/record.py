@@ -90,6 +90,7 @@ def _cameras_json(report: ReportInput) -> list[dict[str, Any]]:
             "centre": camera.centre.tolist(),
             "forward": camera.camera_from_world[2, :3].tolist(),
             "gains": list(camera.gains),
+            "shading": list(camera.shading),
             "held_out": camera.name in report.held_out,
         }
         for camera in (report.rig.cameras if report.rig else ())

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from calibration.rig import Camera
 from sync.align import CameraReport, SyncReport
 from tasks.artefacts.recipe import plain
 from tasks.report.facts import (
@@ -23,7 +24,7 @@ from tasks.report.facts import (
     mean_of,
     still_trend,
 )
-from tasks.report.findings import Finding, Limits
+from tasks.report.findings import Finding, Limits, corner_light
 from tasks.report.pictures import DIFFERENCE_GAIN, comparison
 from tasks.report.plots import Series, Volume, bar_chart, gain_chart, line_chart, rig_views, sparkline
 
@@ -69,7 +70,7 @@ def sections(report: ReportInput, found: Sequence[Finding], limits: Limits) -> l
     bodies: dict[str, Body] = {
         "sync": _sync(report, limits),
         "rig": _rig(report),
-        "colour": _colour(report),
+        "colour": _colour(report, limits),
         "motion": _motion(report),
         "quality": _quality(report, limits),
         "pictures": _pictures(report),
@@ -146,14 +147,30 @@ def _rig(report: ReportInput) -> Body:
     }
 
 
-def _colour(report: ReportInput) -> Body:
+def _colour(report: ReportInput, limits: Limits) -> Body:
     if report.rig is None:
         return "No calibration: the stage did not run."
-    gains = np.array([camera.gains for camera in report.rig.cameras])
-    if (gains == 1).all():
+    cameras = report.rig.cameras
+    gains, shading = (np.array([getattr(camera, of) for camera in cameras]) for of in ("gains", "shading"))
+    if (gains == 1).all() and not shading.any():
         return "All gains are 1: the cameras were not balanced, or did not need it."
-    chart = gain_chart([camera.name for camera in report.rig.cameras], gains, title="Colour gains")
-    return {"least": gains.min(), "most": gains.max(), "gains": chart}
+    corners = corner_light(shading)
+    return {
+        "least": gains.min(),
+        "most": gains.max(),
+        "gains": gain_chart([camera.name for camera in cameras], gains, title="Colour gains"),
+        "shaded": bool(shading.any()),
+        "darkest": corners.min(),
+        "brightest": corners.max(),
+        "corners": [
+            _corner_row(camera, light, limits) for camera, light in zip(cameras, corners.tolist(), strict=True)
+        ],
+    }
+
+
+def _corner_row(camera: Camera, light: float, limits: Limits) -> View:
+    k1, k2 = camera.shading
+    return {"camera": camera.name, "light": light, "k1": k1, "k2": k2, "odd": limits.odd_corner(light)}
 
 
 def _motion(report: ReportInput) -> Body:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
-from calibration.colour import BalanceOptions, balance, with_gains
+from calibration.colour import BalanceOptions, ColourReport, balance, with_colours
+from calibration.held_out import balance_held_out
 from calibration.importers import load_rig
 from calibration.judge import SharedJudgement, judge, judge_shared
 from calibration.rig import Rig
@@ -217,12 +218,13 @@ def store_of(store: Path, sequence: str) -> Path:
 
 @dataclass(frozen=True, kw_only=True)
 class FindPoints(Stage):
-    """Triangulate points and balance the colours: points.npz of the first instant, rig.json with gains, colour.json.
+    """Triangulate points and balance the colours: points.npz, rig.json with gains and shading, colour.json.
 
-    Only fitted cameras take part; the others keep a gain of 1.
+    Points, their colours, and the fitted cameras' gains and shading come from the pictures of fitted cameras alone; the
+    others are brought to these points afterwards.
     """
 
-    name, version = "points", 2
+    name, version = "points", 3
     take: Take
     """All cameras, as filmed"""
     fitted: tuple[str, ...]
@@ -233,33 +235,76 @@ class FindPoints(Stage):
         rig, watch = footage.load_rig(), footage.watch_for_log()
         count = len(footage.load_groups().times_ns)
         chosen = [0, *(instant for instant in options.more_instants if 0 < instant < count)]
-        shown = (
-            {name: picture for name, picture in watch.passing(footage.filmed(instant)).items() if name in self.fitted}
-            for instant in chosen
-        )
+        unseen = [name for name in rig.names if name not in self.fitted]
+        kept = _KeptPictures(work.scratch, rig.names)
+
+        def shown() -> Iterator[dict[str, np.ndarray]]:
+            for instant in chosen:
+                pictures = watch.passing(footage.filmed(instant))
+                if unseen:
+                    kept.add(pictures)
+                yield {name: picture for name, picture in pictures.items() if name in self.fitted}
+
         work.progress(0, 1, "matching features")
         try:
-            points = triangulate(rig.select(self.fitted), shown, options=options.triangulate)
+            points = triangulate(rig.select(self.fitted), shown(), options=options.triangulate)
         except ValueError as problem:  # the rig was judged before: it is the scene that shows too little
             rig.save(work.out / RIG)
             return {"points": 0, "balanced": False, "reason": str(problem), "log_like": watch.suspects}
-        report = balance(points, options=options.balance)
+        work.progress(0, 1, "balancing colours")
+        report = balance(rig.select(self.fitted), points, options=options.balance)
+        report = balance_held_out(
+            rig, points, report, kept.load(), patch_px=options.triangulate.patch_px, options=options.balance
+        )
         points.save(work.out / POINTS)
-        with_gains(rig, report).save(work.out / RIG)
+        with_colours(rig, report).save(work.out / RIG)
         save_json(work.out / COLOUR, without_nan(report.to_json()))
-        notes = {
-            "points": len(points.xyz),
-            "balanced": report.kept,
-            "reason": report.reason,
-            "log_like": watch.suspects,
-        }
-        return {**notes, **_figures(points)}
+        return {"points": len(points.xyz), **_colour_notes(report), "log_like": watch.suspects, **_figures(points)}
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         if not notes["points"]:
             yield "sparse points", f"{notes['reason']}; the fit starts at random places"
-        elif not notes["balanced"]:
+            return
+        if not notes["balanced"]:
             yield "colour balance", notes["reason"]
+        elif not notes["shaded"]:
+            yield "lens shading", notes["shading"]
+        for name, why in notes["unlike"].items():
+            yield f"colour of {name}", why
+
+
+class _KeptPictures:
+    """Pictures of a few instants, kept in files until the colours of their points are known."""
+
+    def __init__(self, folder: Path, cameras: tuple[str, ...]) -> None:
+        self._folder, self._cameras, self._instants = folder, cameras, list[tuple[str, ...]]()
+
+    def add(self, pictures: Mapping[str, np.ndarray]) -> None:
+        """Those of the next instant."""
+        for name, picture in pictures.items():
+            np.save(self._path(len(self._instants), name), picture)
+        self._instants.append(tuple(pictures))
+
+    def load(self) -> list[dict[str, np.ndarray]]:
+        """All of them by instant, mapped into memory."""
+        return [
+            {name: np.load(self._path(index, name), mmap_mode="r") for name in names}
+            for index, names in enumerate(self._instants)
+        ]
+
+    def _path(self, instant: int, camera: str) -> Path:
+        return self._folder / f"picture-{instant}-{self._cameras.index(camera)}.npy"
+
+
+def _colour_notes(report: ColourReport) -> Notes:
+    few = {name: f"only {report.observations[name]} points tell its colours" for name in report.weak_cameras}
+    return {
+        "balanced": report.kept,
+        "reason": report.reason,
+        "shaded": report.shaded,
+        "shading": report.shading_reason,
+        "unlike": few if report.kept else {},  # where nothing is balanced, no camera is unlike others
+    }
 
 
 def complete_instants(groups: FrameGroups, cameras: tuple[str, ...], first: int) -> np.ndarray:

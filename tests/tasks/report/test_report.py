@@ -526,3 +526,21 @@ def test_figures_that_do_not_belong_together_are_refused() -> None:
         MotionCurve(np.zeros(3), (0, 3))
     with pytest.raises(ValueError, match="valid StageOutcome"):
         StageRecord("fit", "nearly", 1.0)
+
+
+def test_shading_is_shown_and_an_odd_corner_is_said():
+    rig = make_rig()
+    lenses = [(-0.3, 0.05), (-0.9, 0.05), *[(0.0, 0.0)] * 4]
+    cameras = tuple(replace(camera, shading=lens) for camera, lens in zip(rig.cameras, lenses, strict=True))
+    report = replace(
+        make_report(), rig=replace(rig, cameras=cameras), unlike={"cam3": "only 8 points tell its colours"}
+    )
+    found = [finding.text for finding in findings(report) if finding.section == "colour"]
+    assert found == [
+        "cam1 seems to have 43% of its light in the corner.",
+        "cam3 keeps its colours as filmed: only 8 points tell its colours.",
+    ]
+    words = Page(page_text(report)).words
+    assert "light in the corner" in words
+    assert "78%" in words
+    assert "No lens shading was found" in Page(page_text(make_report())).words

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from calibration.accept import MatchesReport, Verdict
@@ -16,7 +17,17 @@ from tasks.artefacts.originals import Originals
 from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.calibrate import BorrowRig, RigOptions, _lent, _moved, find_rig, store_of
+from tasks.stages.calibrate import (
+    BorrowRig,
+    FindPoints,
+    PointOptions,
+    RigOptions,
+    _KeptPictures,
+    _lent,
+    _moved,
+    find_rig,
+    store_of,
+)
 from tasks.stages.footage import RIG, PictureOptions, Take
 from tasks.stages.plan import Plan
 from tests.support.artefacts import put
@@ -86,3 +97,27 @@ def test_who_trusts_a_rig_that_was_lent_does_not_have_it_solved_again(tmp_path):
     groups, pictures = STAGE.take.groups, PictureOptions()
     stages = [find_rig(workshop, plan, groups, pictures, RigOptions(trust=trust)) for trust in (False, True)]
     assert stages[0] == stages[1]
+
+
+def test_pictures_kept_for_cameras_that_are_not_fitted_come_back(tmp_path):
+    rng, kept = np.random.default_rng(0), _KeptPictures(tmp_path, NAMES)
+    instants = [{name: rng.integers(0, 256, (4, 6, 3), np.uint8) for name in names} for names in (NAMES, NAMES[1:])]
+    for instant in instants:
+        kept.add(instant)
+    for instant, loaded in zip(instants, kept.load(), strict=True):
+        assert list(loaded) == list(instant)
+        assert all(np.array_equal(loaded[name], instant[name]) for name in instant)
+
+
+def test_colours_that_gain_nothing_are_said(tmp_path):
+    stage = FindPoints(take=STAGE.take, fitted=NAMES, options=PointOptions())
+    notes = {
+        "points": 9,
+        "balanced": True,
+        "shaded": False,
+        "shading": "shading does not pay",
+        "unlike": {"cam02": "few"},
+    }
+    assert list(stage.spared(tmp_path, notes)) == [("lens shading", "shading does not pay"), ("colour of cam02", "few")]
+    plain = {**notes, "balanced": False, "reason": "no need", "unlike": {}}
+    assert list(stage.spared(tmp_path, plain)) == [("colour balance", "no need")]
