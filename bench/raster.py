@@ -100,10 +100,6 @@ class BenchOptions:
     """Gaussians of two figures in the made-up room that are drawn over a layer of the others"""
     layer_tiles: float = 0.34
     """Share of active tiles then"""
-    changing: int = 4_000
-    """Gaussians of two figures in the made-up room that are drawn over a layer of the others"""
-    layer_tiles: float = 0.34
-    """Share of active tiles then"""
     seed: int = 0
 
 

@@ -160,8 +160,8 @@ def _joined(
     still = [torch.as_tensor(array, device=leaves[0].device) for array in arrays(layer.gaussians)]
     highest, near = max(degree, layer.sh_degree), float(layer.view[VIEW_NEAR])
     both = [torch.cat(pair) for pair in zip(still[:4], leaves[:4], strict=True)]
-    sh = [_of_degree(still[4], layer.sh_degree, highest), _of_degree(leaves[4], degree, highest)]
-    scene, valid = _sanitized(*both, torch.cat(sh))
+    both.append(torch.cat([_of_degree(still[4], layer.sh_degree, highest), _of_degree(leaves[4], degree, highest)]))
+    scene, valid = _sanitized(*both)
     pose = torch.as_tensor(camera.camera_from_world, dtype=torch.float32, device=leaves[0].device)
     depth = scene["means"].detach() @ pose[2, :3] + pose[2, 3]
     planes = torch.full_like(depth, options.near)

@@ -107,4 +107,5 @@ def _run_ends(start: np.ndarray, first: np.ndarray) -> np.ndarray:
     """End in the pairs of each run of each tile, int64 [runs]."""
     counts = np.diff(first)
     place = np.arange(first[-1] - 1) - np.repeat(first[:-1] - 1, counts)
-    return np.minimum(np.repeat(start[:-1], counts) + merge.EVERY * (place + 1), np.repeat(start[1:], counts))
+    whole = np.repeat(start[:-1], counts) + merge.EVERY * (place + 1)
+    return np.asarray(np.minimum(whole, np.repeat(start[1:], counts)))

@@ -65,7 +65,8 @@ class Composed:
         if weights:
             raise ValueError("blending weights over a layer are not computed; render all Gaussians in one set")
         view = view_constants(camera, options.near, options.low_pass_px2)
-        if not np.array_equal(np.delete(view, VIEW_NEAR), np.delete(self.view, VIEW_NEAR)):
+        view[VIEW_NEAR] = self.view[VIEW_NEAR]
+        if not np.array_equal(view, self.view):
             raise ValueError(
                 "a layer must be drawn over with the camera and the low-pass filter that it was composed with, "
                 f"but camera {camera.name!r} or its filter is another"
