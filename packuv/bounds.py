@@ -32,12 +32,14 @@ MOST_NUMBER = 1e30
 """Absolute value of a length, a coordinate or a code's value; float32 ends at 3e38"""
 MOST_NS = 4 * 10**18
 """Absolute value of a time, ns; differences of two still fit int64"""
+MOST_LIGHT = 10.0
+"""Absolute value of the natural logarithm of light: 22,000 times as much as in steady light, or as little"""
 MOST_RATE_PART = 2**31 - 1
 """Numerator and denominator of a frame rate: FFmpeg's"""
 MOST_TEXT = 1000
 """Characters of a name"""
-MOST_JSON_BYTES = 24 << 20
-MOST_JSON_VALUES = 2**21
+MOST_JSON_BYTES = 32 << 20
+MOST_JSON_VALUES = 10 * MOST_FRAMES
 """Commas and opening brackets of a JSON document; Python takes up to 200 bytes for a value"""
 MOST_JSON_DEPTH = 64
 ALWAYS_UNPACKED_BYTES, MOST_RATIO = 16 << 20, 64

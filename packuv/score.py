@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from packuv.camera import PinholeCamera
-from packuv.colour import linear_from_srgb, srgb_from_linear
+from packuv.colour import linear_from_srgb, lit, srgb_from_linear
 from packuv.files import save_json
 from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
@@ -33,7 +33,7 @@ class Score:
     camera: str
     held_out: bool
     psnr_db: float | None
-    """Against the picture as filmed"""
+    """Against the picture as filmed, the render in the scene's light of the instant"""
     ssim: float
     psnr_calibrated_db: float | None
     """Against the picture as filmed, the render as the camera would film it: its exposure, gain and lens shading"""
@@ -67,14 +67,13 @@ def score(scene: Scene, views: Views, progress: Progress) -> list[Score]:
             if truth is None:
                 continue
             drawn = artist.draw(gaussians, camera)
+            seen = np.clip(lit(drawn, scene.light(frame)), 0, 1)
             shown = views.response(index, frame).shown(drawn)
             error, before = shown - truth, last.get(camera.name)
             flicker = None if before is None else float(np.abs(error - before).mean())
             last[camera.name] = error
             held_out = camera.name in scene.header.held_out
-            raw, calibrated, own = (
-                _likeness(picture, truth) for picture in (np.clip(drawn, 0, 1), shown, with_own_gain(shown, truth))
-            )
+            raw, calibrated, own = (_likeness(picture, truth) for picture in (seen, shown, with_own_gain(shown, truth)))
             scores.append(Score(frame, time_ns, camera.name, held_out, *raw, *calibrated, *own, flicker))
         progress(frame + 1, len(scene), f"{_mean([s.psnr_calibrated_db for s in scores]) or 0:.2f} dB")
     return scores
@@ -110,7 +109,7 @@ class Artist:
         self._arena = Arena()
 
     def draw(self, gaussians: Gaussians, camera: PinholeCamera) -> np.ndarray:
-        """float32 [3, H, W], in the rig's common colour; lamps are brighter than 1."""
+        """float32 [3, H, W], in the rig's common colour and steady light; lamps are brighter than 1."""
         rendering = render(gaussians, camera, options=self._options, arena=self._arena)
         return cast(np.ndarray, rendering.colour)
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from packuv.colour import lit
 from packuv.files import whole_file
 from packuv.gaussians.codes import DC, OPACITY, REST, ROTATION, SCALE, Codes, Quantizer, attribute_count
 from packuv.gaussians.floats import SH_C0
@@ -141,7 +142,7 @@ def sheet(scene: Scene, frame: int, *, options: UvOptions, triplet: str | None =
     pictures = draw_triplets(codes, seating, sh_degree=degree, options=options)
     if triplet is not None:
         return pictures[triplet]
-    pictures["colour"] = _as_seen(pictures, scene.header.quantizer)
+    pictures["colour"] = _as_seen(pictures, scene.header.quantizer, scene.light(frame))
     return _tiled(pictures)
 
 
@@ -153,10 +154,10 @@ def write_png(path: Path, picture: np.ndarray) -> None:
         partial.write_bytes(content.tobytes())
 
 
-def _as_seen(pictures: Mapping[str, np.ndarray], quantizer: Quantizer) -> np.ndarray:
-    """The base colours on screen, black where no Gaussian is."""
-    values = np.stack([quantizer.attribute_table[DC][k][pictures["colour"][..., k]] for k in range(3)], axis=-1)
-    shown = np.rint(np.clip(0.5 + SH_C0 * values, 0, 1) * 255).astype(np.uint8)
+def _as_seen(pictures: Mapping[str, np.ndarray], quantizer: Quantizer, light: np.ndarray) -> np.ndarray:
+    """The base colours on screen in this light, black where no Gaussian is."""
+    values = np.stack([quantizer.attribute_table[DC][k][pictures["colour"][..., k]] for k in range(3)])
+    shown = np.rint(np.clip(lit(0.5 + SH_C0 * values, light), 0, 1) * 255).astype(np.uint8).transpose(1, 2, 0)
     return np.where(filled(pictures)[..., None], shown, 0)
 
 

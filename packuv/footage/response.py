@@ -15,13 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numba import prange
 
+from packuv import colour
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera
 from packuv.kernels.compile import kernel, prefer_tbb
 
-GAMMA = 2.4
-OFFSET = 0.055
-"""Of sRGB's curve"""
+GAMMA, OFFSET = colour.GAMMA, colour.OFFSET
 _f32 = np.float32
 
 

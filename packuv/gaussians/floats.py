@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from packuv.colour import OFFSET, light_factors
+
 ALPHA_MIN = 1 / 255
 """The alpha below which no renderer draws: a Gaussian in a pixel, and so a Gaussian whose opacity is less."""
 DRAWN_LOGIT = math.log(ALPHA_MIN / (1 - ALPHA_MIN))
@@ -65,6 +67,20 @@ def drawn(gaussians: Gaussians) -> Gaussians:
 def rows_of(gaussians: Gaussians, rows: np.ndarray | slice) -> Gaussians:
     """Some rows, by index or mask, as copies."""
     return Gaussians(*(array[rows].copy() for array in arrays(gaussians)))
+
+
+def lit_gaussians(gaussians: Gaussians, light: np.ndarray) -> Gaussians:
+    """Gaussians of steady light as they are seen in `light`, natural logarithms [3] by channel: other SH coefficients.
+
+    Their pictures are those of `packuv.colour.lit` wherever the Gaussians cover a pixel; what lies between them stays
+    black. In steady light the very same Gaussians come back.
+    """
+    if not np.any(light):
+        return gaussians
+    factors = light_factors(light)
+    sh = gaussians.sh * factors
+    sh[:, 0] += (factors - 1) * (0.5 + OFFSET) / SH_C0
+    return replace(gaussians, sh=sh.astype(np.float32))
 
 
 def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:

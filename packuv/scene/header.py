@@ -31,6 +31,8 @@ KEY, DYNAMIC = 0, 1
 TRACK_NAMES = ("key", "dynamic")
 FLAG_NAMES = ("kept", "changed")
 """Names of the tracks' planes of flags."""
+LIGHT_STEPS = 100_000
+"""Light is stored in steps of 1 / LIGHT_STEPS, a thousandth of a percent"""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,9 @@ class SceneHeader:
     """Summary of the synchronization, JSON"""
     extra: Mapping[str, Any] = field(default_factory=dict)
     """Whatever else should travel along, JSON; programs ignore what they do not know"""
+    light: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """float64 [T, 3]: light of each frame, natural logarithms of factors on linear light, r g b; none given: all 0.
+    The Gaussians are those of steady light. Rounded to LIGHT_STEPS, as the file holds it"""
 
     def __post_init__(self) -> None:
         if self.times_ns.dtype != np.int64 or self.times_ns.ndim != 1:
@@ -57,6 +62,7 @@ class SceneHeader:
             raise ValueError(f"a scene has at most {bounds.MOST_FRAMES} frames, but this one {len(self.times_ns)}")
         if (self.times_ns > bounds.MOST_NS).any() or (self.times_ns < -bounds.MOST_NS).any():
             raise ValueError(f"frame times must lie within {bounds.MOST_NS} ns of 0")
+        object.__setattr__(self, "light", _checked_light(self.light, len(self.times_ns)))
         if not self.rate > 0:
             raise ValueError(f"the frame rate must be positive, but is {self.rate}")
         unknown = set(self.held_out) - {camera.name for camera in self.cameras}
@@ -89,7 +95,7 @@ class SceneHeader:
 
     def first(self, frames: int) -> SceneHeader:
         """The header of a scene that ends after so many frames."""
-        return replace(self, times_ns=self.times_ns[:frames])
+        return replace(self, times_ns=self.times_ns[:frames], light=self.light[:frames])
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -100,6 +106,8 @@ class SceneHeader:
             "held_out": list(self.held_out),
             "sync": dict(self.sync),
             "extra": dict(self.extra),
+            # Absent in steady light, so that scenes of it keep their bytes.
+            **({"light": _light_steps(self.light).T.tolist()} if self.light.any() else {}),
         }
 
     @classmethod
@@ -109,15 +117,44 @@ class SceneHeader:
             field_of(data, name, what)
             for name in ("quantizer", "times_ns", "rate", "cameras", "held_out", "sync", "extra")
         )
+        times_ns = np.array(bounds.wholes(times, "times_ns", least=-bounds.MOST_NS, most=bounds.MOST_NS), np.int64)
         return cls(
             Quantizer.from_json(quantizer),
-            np.array(bounds.wholes(times, "times_ns", least=-bounds.MOST_NS, most=bounds.MOST_NS), np.int64),
+            times_ns,
             bounds.rate_of(rate, "rate"),
             tuple(map(PinholeCamera.from_json, bounds.items(cameras, "cameras", most=bounds.MOST_CAMERAS))),
             _texts(held_out, "held_out", most=bounds.MOST_CAMERAS),
             bounds.fields(sync, "sync"),
             bounds.fields(extra, "extra"),
+            _light_of(data.get("light", []), len(times_ns)),
         )
+
+
+def _checked_light(light: np.ndarray, frames: int) -> np.ndarray:
+    """Light as the file holds it, float64 [frames, 3]."""
+    light = np.asarray(light, np.float64)
+    if light.shape == (0, 3):
+        return np.zeros((frames, 3))
+    if light.shape != (frames, 3):
+        raise ValueError(f"light must be {(frames, 3)}, r g b of each frame, but is {light.shape}")
+    if not (np.abs(light) <= bounds.MOST_LIGHT).all():
+        raise ValueError(f"light must hold natural logarithms within {bounds.MOST_LIGHT:g} of 0")
+    return _light_steps(light) / LIGHT_STEPS
+
+
+def _light_steps(light: np.ndarray) -> np.ndarray:
+    steps: np.ndarray = np.rint(light * LIGHT_STEPS).astype(np.int64)
+    return steps
+
+
+def _light_of(value: object, frames: int) -> np.ndarray:
+    """float64 [frames, 3] of what a header says; none where it lists nothing."""
+    channels = bounds.items(value, "light", most=3)
+    if len(channels) not in (0, 3):
+        raise ValueError(f"light must hold three lists, red, green and blue, but holds {len(channels)}")
+    most = round(bounds.MOST_LIGHT * LIGHT_STEPS)
+    steps = [bounds.wholes(channel, "light", least=-most, most=most, count=frames) for channel in channels]
+    return np.array(steps, np.float64).T.reshape(-1, 3) / LIGHT_STEPS
 
 
 def _texts(value: object, what: str, *, most: int) -> tuple[str, ...]:

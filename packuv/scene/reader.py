@@ -104,6 +104,16 @@ class Scene:
         self._shown = shown, self._segment
         return shown
 
+    def light(self, frame: int) -> np.ndarray:
+        """Light of a frame, float64 [3]: natural logarithms of factors on linear light, r g b; 0 is steady.
+
+        `codes` and `gaussians` are those of steady light: draw them, then see `packuv.colour.lit`; or change them by
+        `packuv.gaussians.floats.lit_gaussians`. Raises IndexError outside the scene.
+        """
+        self.segment_at(frame)
+        light: np.ndarray = self.header.light[frame].copy()
+        return light
+
     def _forget(self) -> None:
         self._segment = self._frame = -1
         self._playback = None

@@ -50,6 +50,10 @@ class Source(Protocol):
         """int64 [T]: when each frame was filmed."""
 
     @property
+    def light(self) -> np.ndarray:
+        """float64 [T, 3]: natural logarithms of each frame's light, r g b; 0 is steady."""
+
+    @property
     def quantizer(self) -> Quantizer: ...
 
     @property
@@ -105,6 +109,10 @@ class SegmentSource:
         return np.array([int(index * 10**9 / self.rate) for index in range(self.segments[-1].stop)], dtype=np.int64)
 
     @property
+    def light(self) -> np.ndarray:
+        return np.zeros((len(self.times_ns), 3))
+
+    @property
     def segments(self) -> tuple[range, ...]:
         start = self.parts[0].first
         return tuple(range(part.first - start, part.first - start + len(part)) for part in self.parts)
@@ -128,6 +136,7 @@ class SceneSource:
         header = scene.header
         self._scene = scene
         self.name, self.rate, self.times_ns = scene.path.name, header.rate, header.times_ns
+        self.light = header.light
         self.quantizer, self.cameras, self.held_out = header.quantizer, header.cameras, frozenset(header.held_out)
         self.near: float | None = header.extra.get("near")
         self.segments = tuple(range(entry.first, entry.first + entry.frames) for entry in scene.index.segments)
@@ -195,6 +204,7 @@ def describe(source: Source) -> dict[str, Any]:
         "near": near_plane(source),
         "segments": [{"first": frames.start, "length": len(frames)} for frames in source.segments],
         "cameras": [{**camera.to_json(), "held_out": camera.name in source.held_out} for camera in source.cameras],
+        **({"light": source.light.tolist()} if source.light.any() else {}),
     }
 
 

@@ -146,15 +146,16 @@ void main() {
 
 const SHOW = `#version 300 es
 precision highp float;
-uniform highp sampler2D light;
-uniform vec3 background;
+uniform highp sampler2D sums;
+uniform vec3 background, light; // what light of the frame makes of sRGB + 0.055
 uniform vec2 range;
 uniform int mode;
 uniform vec3 stops[${DEPTH_STOPS.length}];
 out vec4 result;
 void main() {
-  vec4 sum = texelFetch(light, ivec2(gl_FragCoord.xy), 0);
+  vec4 sum = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
   vec3 rgb = sum.rgb;
+  if (mode == 0) rgb = light * (rgb + 0.055 * sum.a) - 0.055 * sum.a; // the same for each Gaussian's colour
   if (mode == 1 && sum.a > 0.0) {
     float depth = sum.r / sum.a; // mean depth, weighted by what each Gaussian adds to the pixel
     float t = clamp(log(depth / range.x) / log(range.y / range.x), 0.0, 1.0) * float(${DEPTH_STOPS.length - 1});
@@ -261,17 +262,18 @@ export class SplatView {
   }
 
   // view: {rotation (row-major camera_from_world), eye, lens [fx fy cx cy] px, near}
-  // look: {mode, scale, background [3], range [2], lines}
+  // look: {mode, scale, background [3], range [2], light [3], lines}
   draw(view, look) {
     const { gl } = this;
     this.accumulate(view, look, MODES.indexOf(look.mode));
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.useProgram(this.show.handle);
     gl.bindVertexArray(this.empty);
-    bind(gl, 0, gl.TEXTURE_2D, this.light);
+    bind(gl, 0, gl.TEXTURE_2D, this.sums);
     const { uniforms } = this.show;
-    gl.uniform1i(uniforms.light, 0);
+    gl.uniform1i(uniforms.sums, 0);
     gl.uniform3fv(uniforms.background, look.background);
+    gl.uniform3fv(uniforms.light, look.light);
     gl.uniform2fv(uniforms.range, look.range);
     gl.uniform1i(uniforms.mode, MODES.indexOf(look.mode));
     gl.uniform3fv(uniforms.stops, DEPTH_STOPS.flat().map((byte) => byte / 255));
@@ -291,9 +293,9 @@ export class SplatView {
   accumulate(view, look, mode) {
     const { gl } = this;
     this.resize();
-    if (!this.slotRows) return this.clearLight();
+    if (!this.slotRows) return this.clearSums();
     this.runProjection(view, look, mode);
-    this.clearLight();
+    this.clearSums();
     gl.useProgram(this.splat.handle);
     gl.bindVertexArray(this.quads);
     bind(gl, 0, gl.TEXTURE_2D, this.shapes);
@@ -349,7 +351,7 @@ export class SplatView {
     gl.uniform1f(uniforms.near, view.near);
   }
 
-  clearLight() {
+  clearSums() {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
     gl.viewport(0, 0, ...this.size);
@@ -361,11 +363,11 @@ export class SplatView {
     const { gl, canvas } = this;
     if (this.size[0] === canvas.width && this.size[1] === canvas.height) return;
     this.size = [canvas.width, canvas.height];
-    gl.deleteTexture(this.light);
-    this.light = texture(gl, gl.TEXTURE_2D);
+    gl.deleteTexture(this.sums);
+    this.sums = texture(gl, gl.TEXTURE_2D);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, ...this.size);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.light, 0);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.sums, 0);
   }
 
   allocate(rows) {

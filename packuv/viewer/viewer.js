@@ -5,12 +5,13 @@ import { Navigation, frusta, worldOf } from "./navigation.js";
 
 const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
 const STALL_NOTICE_MS = 250;
+const GAMMA = 2.4; // a factor on light is its power of 1 / 2.4 on sRGB + 0.055
 
 const at = (id) => document.getElementById(id);
 const canvas = at("picture");
 const wish = new URLSearchParams(location.hash.slice(1)); // frame, camera, mode, play=0, scale, background, bare=1
 
-const look = { mode: "colour", scale: 1, background: [0, 0, 0], range: [1, 2], lines: false };
+const look = { mode: "colour", scale: 1, background: [0, 0, 0], range: [1, 2], light: [1, 1, 1], lines: false };
 const player = {
   frame: 0, shown: -1, playing: wish.get("play") !== "0", loops: true, speed: 1, due: 0, stalled: false, stalledAt: 0,
 };
@@ -54,6 +55,7 @@ const receive = {
     settleRange(message.range, message.frame !== player.shown && player.shown >= 0);
     if (message.frame !== player.shown) meter.frames++;
     player.shown = message.frame;
+    look.light = (scene.light?.[message.frame] ?? [0, 0, 0]).map((log) => Math.exp(log / GAMMA));
     Object.assign(meter, { count: message.count, moving: message.moving, sort_ms: message.sort_ms });
     dirty = true;
   },

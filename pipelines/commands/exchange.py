@@ -22,8 +22,12 @@ if TYPE_CHECKING:
 
 
 def export_frames(arguments: argparse.Namespace) -> int:
-    """`packuv export SCENE`: one frame as a file, or several as a folder of files, of another program."""
+    """`packuv export SCENE`: one frame as a file, or several as a folder of files, of another program.
+
+    Such files know no light: each frame goes out as it is seen in its own.
+    """
     from packuv.files import whole_folder
+    from packuv.gaussians.floats import lit_gaussians
     from packuv.interchange import write_gaussians
     from packuv.scene import open_scene
 
@@ -31,13 +35,15 @@ def export_frames(arguments: argparse.Namespace) -> int:
     with open_scene(arguments.scene) as scene:
         if arguments.frame is not None:
             check_frame(len(scene), arguments.frame)
-            count = write_gaussians(arguments.output, scene.gaussians(arguments.frame), kind=kind)
+            gaussians = lit_gaussians(scene.gaussians(arguments.frame), scene.light(arguments.frame))
+            count = write_gaussians(arguments.output, gaussians, kind=kind)
             print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}")
             return 0
         frames = frames_of(len(scene), arguments.frames)
         with whole_folder(arguments.output) as folder, shown(arguments, "export") as progress:
             for done, frame in enumerate(frames, start=1):
-                write_gaussians(folder / f"{frame:06d}{kind.suffix}", scene.gaussians(frame), kind=kind)
+                gaussians = lit_gaussians(scene.gaussians(frame), scene.light(frame))
+                write_gaussians(folder / f"{frame:06d}{kind.suffix}", gaussians, kind=kind)
                 progress(done, len(frames))
     print(f"{arguments.output}: {len(frames)} files, frames {frames.start} to {frames.stop - 1}")
     return 0

@@ -6,6 +6,7 @@ What turns scenes into other programs' files, or those into scenes, is in `pipel
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,8 @@ from tasks.artefacts.recipe import override
 from tasks.artefacts.store import find_stores
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from packuv.camera import PinholeCamera
 
 
@@ -52,6 +55,7 @@ def info(arguments: argparse.Namespace) -> int:
             "seconds": float((header.times_ns[-1] - header.times_ns[0]) / 1e9 + 1 / header.rate),
             "bytes_per_frame": size / len(scene),
             "sh_degree": header.quantizer.sh_degree,
+            "light": _light_range(header.light),
             "lossless": index.tolerance.exact,
             "tolerance": vars(index.tolerance),
             "cameras": [camera.name for camera in header.cameras],
@@ -68,11 +72,17 @@ def info(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _light_range(light: np.ndarray) -> list[float] | None:
+    """Least and most of any channel, as factors on linear light; None where it is steady."""
+    return [math.exp(light.min()), math.exp(light.max())] if light.any() else None
+
+
 def _info_text(facts: Mapping[str, Any]) -> str:
     counts = [segment["gaussians"] for segment in facts["segments"]]
     moving = [segment["dynamic"] for segment in facts["segments"]]
     held_out = f" (held out: {', '.join(facts['held_out'])})" if facts["held_out"] else ""
     within = "within {position} steps of a position and {attribute} of any other code, of what was fitted"
+    lights = ["light      {:.1%} to {:.1%} of steady light".format(*facts["light"])] if facts["light"] else []
     exact = "exactly as fitted" if facts["lossless"] else within.format(**facts["tolerance"])
     return "\n".join(
         [
@@ -82,6 +92,7 @@ def _info_text(facts: Mapping[str, Any]) -> str:
             f"gaussians  {min(counts):,} to {max(counts):,}, of which {min(moving):,} to {max(moving):,} move; "
             f"SH degree {facts['sh_degree']}",
             f"codes      {exact}",
+            *lights,
             f"cameras    {len(facts['cameras'])}{held_out}",
             f"tools      {', '.join(f'{name} {version}' for name, version in facts['tools'].items())}",
         ]
@@ -125,7 +136,8 @@ def _verify_store(arguments: argparse.Namespace) -> int:
 
 
 def render(arguments: argparse.Namespace) -> int:
-    """`packuv render`: <frame>.png for each frame, numbered as in the scene."""
+    """`packuv render`: <frame>.png for each frame in its light, numbered as in the scene."""
+    from packuv.colour import lit
     from packuv.fit.device import choose_device
     from packuv.scene import open_scene
     from packuv.score import Artist, write_picture
@@ -139,7 +151,8 @@ def render(arguments: argparse.Namespace) -> int:
         arguments.output.mkdir(parents=True, exist_ok=True)
         artist = Artist(scene, device)
         for done, frame in enumerate(frames, start=1):
-            write_picture(arguments.output / f"{frame:06d}.png", artist.draw(scene.gaussians(frame), camera))
+            picture = lit(artist.draw(scene.gaussians(frame), camera), scene.light(frame))
+            write_picture(arguments.output / f"{frame:06d}.png", picture)
             progress(done, len(frames))
     size = f"{camera.width}x{camera.height}"
     print(f"{arguments.output}: {len(frames)} pictures of camera {camera.name}, {size}")

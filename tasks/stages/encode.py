@@ -39,7 +39,7 @@ class Encode(Stage):
     options: EncodeOptions
 
     def build(self, work: Work) -> Notes:
-        header = scene_header(Footage(self.take, work.site), self.held_out, KeyState.load(work.path(self.key)))
+        header = self._header(work.site)
         segments = [work.path(key) / SEGMENT for key in self.segments]
         path = work.out / SCENE
         summary = write_scene(path, segments, header, options=self.options, progress=work.progress)
@@ -54,10 +54,13 @@ class Encode(Stage):
         from the first on. The file is whole or absent at any time, and takes the place of one that is there. Nothing
         goes to the store, for the stage makes the same file of all segments.
         """
-        header = scene_header(Footage(self.take, site), self.held_out, KeyState.load(site.path(self.key)))
+        header = self._header(site)
         segments = [site.path(key) / SEGMENT for key in self.segments]
         frames = sum(len(Segment.load(part)) for part in segments)
         return write_scene(path, segments, header.first(frames), options=self.options).frames
+
+    def _header(self, site: Site) -> SceneHeader:
+        return scene_header(Footage(self.take, site), self.held_out, KeyState.load(site.path(self.key)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +95,14 @@ class Verify(Stage):
         return notes
 
 
-def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState) -> SceneHeader:
-    """What the scene says about its capture. No path and no clock time goes in: same input, same bytes."""
+def scene_header(
+    footage: Footage, held_out: tuple[str, ...], key: KeyState, light: np.ndarray | None = None
+) -> SceneHeader:
+    """What the scene says about its capture. No path and no clock time goes in: same input, same bytes.
+
+    `light`, float [T, 3], is the natural logarithm of light of each instant, without any camera's own exposure; None:
+    it is steady.
+    """
     groups = footage.site.path(footage.take.groups)
     rig, report, transfer = footage.load_rig(), SyncReport.load(groups), footage.take.pictures.transfer
     return SceneHeader(
@@ -119,6 +128,7 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState) -> 
             # Absent where tags decide, so that scenes of such captures keep their bytes.
             **({"transfer": str(transfer)} if transfer else {}),
         },
+        **({} if light is None else {"light": light}),
     )
 
 

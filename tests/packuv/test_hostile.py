@@ -68,7 +68,9 @@ def test_depth_is_that_of_lists_and_objects():
 
 
 def test_the_header_of_the_longest_scene_fits():
-    """A frame's time, digest, size, checksum, prediction and form, and their commas; a segment for 30 of them."""
-    frame = len(f'{10**18},"{"f" * 32}",{10**7},{2**32 - 1},2,1,')
-    segment = len(json.dumps(dict.fromkeys(("differences", "dynamic", "first", "first_packet"), 10**6))) * 3
-    assert bounds.MOST_FRAMES * (frame + segment / 30) < bounds.MOST_JSON_BYTES
+    """A frame's time, digest, size, checksum, prediction, form and light, and their commas; a segment for 30 of them."""
+    light = "-1000000," * 3
+    frame = f'{10**18},"{"f" * 32}",{10**7},{2**32 - 1},2,1,{light}'
+    segment = json.dumps(dict.fromkeys(("differences", "dynamic", "first", "first_packet"), 10**6)) * 3
+    assert bounds.MOST_FRAMES * (len(frame) + len(segment) / 30) < bounds.MOST_JSON_BYTES
+    assert bounds.MOST_FRAMES * (frame.count(",") + segment.count(",") / 30) < bounds.MOST_JSON_VALUES

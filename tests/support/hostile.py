@@ -29,6 +29,7 @@ import av
 import cv2
 import numpy as np
 
+from packuv.bounds import MOST_LIGHT
 from packuv.camera import PinholeCamera
 from packuv.files import load_json
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
@@ -124,7 +125,10 @@ def make_scene(path: Path) -> None:
         quantizer = Quantizer(np.zeros(3), 1.0, np.full(3, 5.0), low, high)
         camera = PinholeCamera("cam0", 64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4))
         times = np.arange(6, dtype=np.int64) * 33_333_333 + 1_700_000_000 * 10**9
-        header = SceneHeader(quantizer, times, Fraction(30), (camera,), ("cam0",), {"worst_ms": 1.5}, {"near": 0.1})
+        light = rng.normal(0, 0.1, (6, 3))
+        header = SceneHeader(
+            quantizer, times, Fraction(30), (camera,), ("cam0",), {"worst_ms": 1.5}, {"near": 0.1}, light
+        )
         write_scene(path, parts, header)
 
 
@@ -168,6 +172,7 @@ def read_scene(path: Path) -> None:
         tables_bytes(source.quantizer)
         assert all(camera.matrix.shape == (3, 3) for camera in scene.header.cameras)
         assert scene.header.near > 0
+        assert np.abs(scene.header.light).max() <= MOST_LIGHT
         for frame in range(min(len(scene), 50)):
             scene.gaussians(frame)
     verify_scene(path, threads=1)
@@ -332,6 +337,9 @@ def write_worst(folder: Path) -> None:
         "rows": (("segments", 0, "rows"), 2**60),
         "near": (("extra", "near"), 1e400),
         "times": (("times_ns",), [2**63 - 1 - k for k in range(6)]),
+        "light": (("light", 1, 3), 10**400),
+        "light-frames": (("light",), [[1] * 300_000] * 3),
+        "light-nested": (("light", 2), [[0] * 3] * 6),
         "self-reference": (("segments", 1, "reference"), 1),
         "deep-extra": (("extra", "x"), DEEP),
         "terminal": (("cameras", 0, "name"), "\x1b]0;owned\x07"),
@@ -341,8 +349,8 @@ def write_worst(folder: Path) -> None:
     maker.write_text(folder / "nested.mkv", nested)
     maker.write_text(folder / "nested-lists.mkv", b"[" * 3_000_000)
     maker.write_text(folder / "many-values.mkv", b"[" + b"{}," * 3_000_000 + b"0]")
-    maker.write_text(folder / "large.mkv", b'{"a":"' + b"x" * (25 << 20) + b'"}')
-    maker.write_text(folder / "wide-text.mkv", b'{"a":"' + b"x" * (20 << 20) + "\U0001f600".encode() + b'"}')
+    maker.write_text(folder / "large.mkv", b'{"a":"' + b"x" * (33 << 20) + b'"}')
+    maker.write_text(folder / "wide-text.mkv", b'{"a":"' + b"x" * (28 << 20) + "\U0001f600".encode() + b'"}')
     chained = copy.deepcopy(maker.document)
     chained["segments"] = [{**chained["segments"][1], "reference": k - 1 if k else None} for k in range(5000)]
     maker.write(folder / "chain.mkv", chained)
