@@ -19,15 +19,18 @@ from typing import Any
 
 import numpy as np
 
+from packuv.bounds import MOST_FRAMES, MOST_LIGHT, shown
 from packuv.files import save_npz
-from packuv.footage.ratios import PARTS, Ratios, measure_ratios
+from packuv.footage.ratios import Ratios, measure_ratios
 from packuv.footage.reader import FrameReader
 from packuv.progress import Progress, no_progress
 
-STEP = 2.0**-13
-"""Logarithms are kept as multiples of this, 0.012 %: a thirtieth of a grey level of 255 at most"""
-MOST_STEPS = 2**15 - 1
-"""Light up to exp(4) times as bright, so that 16 bits hold it"""
+STEPS = 100_000
+"""Logarithms are kept in steps of 1 / STEPS, as scene files hold them"""
+ROUNDS = 10
+"""Levels and light in turn; cameras that start late settle within these"""
+FINEST = 0.001
+"""Deviation between cameras below which none is doubted"""
 
 
 @dataclass(frozen=True)
@@ -51,8 +54,8 @@ class LightOptions:
 
     def __post_init__(self) -> None:
         if self.width < 16 or self.samples < 1:
-            raise ValueError(f"light is measured in pictures 16 px wide and one sample at least: {self.width=}, {self.samples=}")
-        if not (self.least_light >= 0 and self.least_exposure >= 0 and self.exposure_sigmas >= 0):
+            raise ValueError(f"light needs pictures 16 px wide, and a sample: {self.width=}, {self.samples=}")
+        if min(self.least_light, self.least_exposure, self.exposure_sigmas) < 0:
             raise ValueError("least_light, least_exposure and exposure_sigmas must not be negative")
         if not 0 < self.most_left <= 1:
             raise ValueError(f"most_left must lie in (0, 1], but is {self.most_left}")
@@ -95,9 +98,8 @@ class Light:
 
     def save(self, path: Path) -> None:
         """As npz."""
-        names = np.array(list(self.exposures), dtype=str)
-        own = np.stack(list(self.exposures.values())) if self.exposures else np.empty((0, *self.light.shape), np.float32)
-        save_npz(path, {"light": self.light, "cameras": names, "exposures": own})
+        own = np.array(list(self.exposures.values()), np.float32).reshape(-1, *self.light.shape)
+        save_npz(path, {"light": self.light, "cameras": np.array(list(self.exposures), str), "exposures": own})
 
     @classmethod
     def load(cls, path: Path) -> Light:
@@ -187,12 +189,6 @@ def common(own: np.ndarray) -> np.ndarray:
     return np.asarray(flat - flat.mean(axis=0))
 
 
-ROUNDS = 10
-"""Levels and light in turn; cameras that start late settle within these"""
-FINEST = 0.001
-"""Deviation between cameras below which none is doubted"""
-
-
 def _centre(values: np.ndarray, axis: int) -> np.ndarray:
     """Tukey's estimate along an axis, which is kept, of [T, C, 3], NaN where unknown; NaN where nothing is known."""
     known = np.isfinite(values)
@@ -200,7 +196,8 @@ def _centre(values: np.ndarray, axis: int) -> np.ndarray:
     for _ in range(5):
         error = np.where(known, np.abs(values - centre), np.nan)
         scale = 1.4826 * np.nan_to_num(_median(error.reshape(-1, 1, 3), 0))[0, 0]  # [3]
-        weights = np.where(known, np.maximum(0, 1 - (np.nan_to_num(error) / (4.7 * np.maximum(scale, FINEST))) ** 2) ** 2, 0)
+        near = np.nan_to_num(error) / (4.7 * np.maximum(scale, FINEST))
+        weights = np.where(known, np.maximum(0, 1 - near**2) ** 2, 0)
         total = weights.sum(axis=axis, keepdims=True)
         mean = (weights * np.nan_to_num(values)).sum(axis=axis, keepdims=True)
         centre = np.divide(mean, total, out=centre, where=total > 0)
@@ -251,19 +248,12 @@ def _spreads(own: np.ndarray) -> list[float]:
 
 
 def _deviation(values: np.ndarray, axis: int) -> np.ndarray:
-    """Root mean square about the mean of what is known; NaN where nothing is."""
+    """Root mean square about the mean of what is known; NaN where nothing is. (NumPy's own warns there.)"""
     known = np.isfinite(values)
-    count = known.sum(axis=axis)
-    mean = _mean(values, axis)
-    square = np.where(known, (np.nan_to_num(values) - np.nan_to_num(np.expand_dims(mean, axis))) ** 2, 0).sum(axis=axis)
-    return np.sqrt(np.divide(square, count, out=np.full(count.shape, np.nan), where=count > 0))
-
-
-def _mean(values: np.ndarray, axis: int) -> np.ndarray:
-    """Of what is known; NaN where nothing is."""
-    count = np.isfinite(values).sum(axis=axis)
-    total: np.ndarray = np.nan_to_num(values).sum(axis=axis)
-    return np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
+    count = np.maximum(known.sum(axis=axis, keepdims=True), 1)
+    mean = np.where(known, values, 0).sum(axis=axis, keepdims=True) / count
+    square = np.where(known, (values - mean) ** 2, 0).sum(axis=axis, keepdims=True) / count
+    return np.asarray(np.where(known.any(axis=axis), np.sqrt(square).squeeze(axis), np.nan))
 
 
 def _own_exposure(ratio: Ratios, light: np.ndarray, options: LightOptions) -> np.ndarray | None:
@@ -272,12 +262,15 @@ def _own_exposure(ratio: Ratios, light: np.ndarray, options: LightOptions) -> np
     if np.isnan(rest).all():
         return None
     size = float(np.nanmax(_deviation(rest, axis=0)))
-    apart = ratio.parts - ratio.whole[:, None]  # [T, PARTS, 3]
-    apart = _deviation(apart, axis=0)[np.isfinite(_deviation(apart, axis=0))]
-    doubt = float(np.sqrt((apart**2).mean())) if len(apart) > 3 else np.inf
-    if size < options.least_exposure or size < options.exposure_sigmas * doubt:
+    apart = _deviation(ratio.parts - ratio.whole[:, None], axis=0)  # [PARTS, 3]
+    apart = apart[np.isfinite(apart).all(axis=1)]
+    if len(apart) < 2 or size < max(options.least_exposure, options.exposure_sigmas * _root_mean_square(apart)):
         return None
     return _without(ratio.whole, light)
+
+
+def _root_mean_square(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def _without(whole: np.ndarray, light: np.ndarray) -> np.ndarray:
@@ -287,11 +280,28 @@ def _without(whole: np.ndarray, light: np.ndarray) -> np.ndarray:
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:
-    steps = np.clip(np.rint(values / STEP), -MOST_STEPS, MOST_STEPS)
-    return np.asarray(steps * STEP, dtype=np.float32)
+    return np.asarray(np.rint(values * STEPS) / STEPS, dtype=np.float32)
 
 
 def packed(values: np.ndarray) -> str:
-    """Logarithms [T, 3], multiples of STEP, as text for a scene's header: 16-bit differences, compressed."""
-    steps = np.rint(values / STEP).astype("<i2")
-    return base64.b64encode(zlib.compress(np.diff(steps, axis=0, prepend=np.zeros_like(steps[:1])).T.tobytes(), 9)).decode()
+    """Logarithms float32 [T, 3], in steps of 1 / STEPS, as text for a scene's header: differences, compressed."""
+    steps = np.rint(values.astype(np.float64) * STEPS).astype("<i4")
+    differences = np.diff(steps, axis=0, prepend=np.zeros_like(steps[:1]))
+    return base64.b64encode(zlib.compress(differences.T.tobytes(), 9)).decode()
+
+
+def unpacked(text: object, instants: int, what: str) -> np.ndarray:
+    """Inverse of `packed`: float32 [instants, 3], of text that holds as many or more; raises ValueError for others."""
+    refused = ValueError(f"{what} must be the packed exposure of {instants} instants or more, but is {shown(text)}")
+    try:
+        data = base64.b64decode(text, validate=True) if isinstance(text, str) else b""
+        unpacker = zlib.decompressobj()
+        content = unpacker.decompress(data, 12 * MOST_FRAMES)
+    except (ValueError, zlib.error):
+        raise refused from None
+    if unpacker.unconsumed_tail or len(content) % 12 or len(content) < 12 * instants:
+        raise refused
+    steps = np.cumsum(np.frombuffer(content, "<i4").reshape(3, -1).T[:instants], axis=0, dtype=np.int64)
+    if (np.abs(steps) > MOST_LIGHT * STEPS).any():
+        raise ValueError(f"{what} must hold natural logarithms within {MOST_LIGHT:g} of 0")
+    return np.asarray(steps / STEPS, dtype=np.float32)

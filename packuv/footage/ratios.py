@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from packuv.footage.response import GAMMA, OFFSET
+from packuv.colour import GAMMA, OFFSET
 from packuv.kernels.compile import kernel
 from packuv.progress import Progress, no_progress
 
@@ -28,7 +28,7 @@ PARTS = 4
 LEAST_PIXELS = 200
 """Steady pixels without which a camera tells nothing; a quarter of it for a part"""
 LEAST_SHARE = 0.25
-"""Of the steady pixels that must agree at an instant: after a cut or behind a crowd they do not"""
+"""Of all pixels that count, moving or not, that must agree at an instant: after a cut or behind a crowd they do not"""
 LEVEL = 1 / 255
 ROUNDS = 5
 REACH = 1.5
@@ -37,8 +37,8 @@ _BINS, _FINE = 300, 16
 """Of the histogram whose top starts an estimate; of the errors', a grey level"""
 _CUT = 4.0
 """Errors that weigh nothing, in deviations"""
-_MOST_DEVIATION = 3
-"""Grey levels: what is farther apart than steady pixels can be only blurs the estimate"""
+_MOST_DEVIATION = 2
+"""Grey levels: small pictures have less noise than that, and more would let other things agree by chance"""
 _f32 = np.float32
 _VALUES = (np.arange(256) * LEVEL + OFFSET).astype(_f32)
 
@@ -62,16 +62,16 @@ class _Reference:
     values: np.ndarray
     """float32 [P, 3], sRGB + 0.055; 0 in channels that do not count"""
     part: np.ndarray
-    """uint8 [P]: quarter of the picture that each lies in"""
+    """uint8 [P]: quarter of the picture that each lies in; PARTS for one that is not steady, and has no say"""
 
     @classmethod
-    def of(cls, values: np.ndarray, size: tuple[int, int]) -> _Reference:
-        """From whole pictures, [H * W, 3] of `size` height and width."""
+    def of(cls, values: np.ndarray, steady: np.ndarray, size: tuple[int, int]) -> _Reference:
+        """From whole pictures, [H * W, 3] and bool [H * W], of `size` height and width."""
         height, width = size
         pixels = np.flatnonzero(values.any(axis=1))
         rows, columns = np.divmod(pixels, width)
         part = 2 * (2 * rows >= height) + (2 * columns >= width)
-        return cls(pixels, values[pixels].astype(_f32), part.astype(np.uint8))
+        return cls(pixels, values[pixels].astype(_f32), np.where(steady[pixels], part, PARTS).astype(np.uint8))
 
     def ratio(self, small: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Factors on sRGB + 0.055, float64 [3] and [PARTS, 3], of a picture uint8 [H, W, 3]; NaN where unknown."""
@@ -116,38 +116,39 @@ def _reference(pictures: np.ndarray) -> _Reference | None:
     size = pictures.shape[1], pictures.shape[2]
     shown = _VALUES[pictures].reshape(len(pictures), -1, 3)  # [S, P, 3]
     usual = np.median(shown, axis=0)
-    counts = _mid_tones(usual, size)
+    counts, steady = _mid_tones(usual, size), np.ones(len(usual), bool)
     for _ in range(2):  # the second time without what moved, against pictures of one brightness
-        reference = _Reference.of(np.where(counts, usual, 0), size)
+        reference = _Reference.of(np.where(counts, usual, 0), steady, size)
         factors = np.stack([reference.ratio(picture)[0] for picture in pictures])  # [S, 3]
         known = np.isfinite(factors).all(axis=1)
         if not known.any():
             return None
         level = shown[known] / factors[known, None].astype(_f32)
         usual = np.median(level, axis=0)
-        counts &= _steady(np.sqrt(((level - usual) ** 2).mean(axis=(0, 2))))[:, None]
+        steady = _steady(np.sqrt(((level - usual) ** 2).mean(axis=(0, 2))), counts.any(axis=1))
     # The mean of what agrees with the median is finer than a grey level.
     close = np.abs(level - usual) < 4 * LEVEL
     usual = np.divide(np.where(close, level, 0).sum(axis=0), close.sum(axis=0), out=usual, where=close.any(axis=0))
-    reference = _Reference.of(np.where(counts, usual, 0), size)
-    return reference if len(reference.pixels) >= LEAST_PIXELS else None
+    reference = _Reference.of(np.where(counts, usual, 0), steady, size)
+    return reference if (reference.part < PARTS).sum() >= LEAST_PIXELS else None
 
 
 def _mid_tones(usual: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Where light acts as it should, bool [P, 3]: channels bright enough, of pixels that are not beside clipped ones."""
+    """Where light acts as it should, bool [P, 3]: channels bright enough, of pixels not beside clipped ones."""
     brightest = usual.max(axis=1).reshape(size).astype(_f32)
     below = cv2.dilate(brightest, np.ones((3, 3), np.uint8)).reshape(-1) < BRIGHTEST + OFFSET
     return np.asarray((usual > DARKEST + OFFSET) & below[:, None])
 
 
-def _steady(spread: np.ndarray) -> np.ndarray:
-    """Pixels that change over time, root mean square [P], by little more than noise."""
-    limit = np.clip(3 * np.quantile(spread, 0.25), 1.5 * LEVEL, 5 * LEVEL)
-    return np.asarray(spread <= limit)
+def _steady(spread: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Pixels that change over time, root mean square [P], by little more than noise; `counts` is bool [P]."""
+    least = np.quantile(spread[counts], 0.25) if counts.any() else 0.0
+    return np.asarray(spread <= np.clip(3 * least, 1.5 * LEVEL, 5 * LEVEL))
 
 
 def _divided(seen: np.ndarray, light: np.ndarray, known: np.ndarray) -> np.ndarray:
-    factors: np.ndarray = np.divide(seen, light, out=np.full(seen.shape, np.nan), where=known & (light > 0) & (seen > 0))
+    factors, known = np.full(seen.shape, np.nan), known & (light > 0) & (seen > 0)
+    np.divide(seen, light, out=factors, where=known)
     return factors
 
 
@@ -157,36 +158,49 @@ def _compare(codes, values, part, table, light, seen, counts, share):
 
     `codes` is uint8 [P, 3], `values` float32 [P, 3], 0 in what does not count, `table` the value of each code. `light`
     gets the sums of the reference squared, `seen` of reference times picture, float64 [PARTS, 3]: brighter pixels
-    count for more, as their noise is a smaller share. `counts` is what weighs anything, `share` [3] how much of all.
+    count for more, as their noise is a smaller share. `counts` is what weighs anything, `share` [3] how much of all
+    agrees, pixels without a part included.
 
     Weights are Tukey's about the most frequent ratio: what moved there weighs nothing.
     """
     for c in range(3):
-        factor, valid = _most_frequent(codes, values, table, c)
-        for step in range(ROUNDS):
-            cut = _f32(_CUT) * _deviation(codes, values, table, c, factor, valid)
+        factor, valid = _most_frequent(codes, values, part, table, c)
+        deviation = _f32(1)
+        for _step in range(ROUNDS):
+            deviation = _deviation(codes, values, part, table, c, factor, valid)
             light[:, c] = 0
             seen[:, c] = 0
             counts[:, c] = 0
             for p in range(len(codes)):
                 r, x = values[p, c], table[codes[p, c]]
-                e = (x - factor * r) / cut
-                if r > 0 and e * e < 1:
+                e = (x - factor * r) / (_f32(_CUT) * deviation)
+                if r > 0 and part[p] < PARTS and e * e < 1:
                     weight = (1 - e * e) * (1 - e * e)
                     light[part[p], c] += weight * r * r
                     seen[part[p], c] += weight * r * x
                     counts[part[p], c] += 1
             if light[:, c].sum() > 0:
                 factor = _f32(seen[:, c].sum() / light[:, c].sum())
-        share[c] = counts[:, c].sum() / max(1, valid)
+        share[c] = _agreeing(codes, values, table, c, factor, 2 * deviation)
 
 
 @kernel(inner=True)
-def _most_frequent(codes, values, table, c):
-    """The ratio that most are close to, and how many there are."""
-    bins, valid = np.zeros(_BINS + 4, np.int64), 0
+def _agreeing(codes, values, table, c, factor, most):
+    """Share of what counts that has this ratio, but for so much."""
+    agreeing, all_of_them = 0, 0
     for p in range(len(codes)):
         if values[p, c] > 0:
+            all_of_them += 1
+            agreeing += abs(table[codes[p, c]] - factor * values[p, c]) < most
+    return agreeing / max(1, all_of_them)
+
+
+@kernel(inner=True)
+def _most_frequent(codes, values, part, table, c):
+    """The ratio that most steady pixels are close to, and how many there are."""
+    bins, valid = np.zeros(_BINS + 4, np.int64), 0
+    for p in range(len(codes)):
+        if values[p, c] > 0 and part[p] < PARTS:
             place = np.log(table[codes[p, c]] / values[p, c]) / _f32(2 * REACH) + _f32(0.5)
             bins[2 + min(max(int(place * _f32(_BINS)), 0), _BINS - 1)] += 1
             valid += 1
@@ -199,11 +213,11 @@ def _most_frequent(codes, values, table, c):
 
 
 @kernel(inner=True)
-def _deviation(codes, values, table, c, factor, valid):
-    """Of a normal distribution with the median magnitude of the errors, within limits."""
+def _deviation(codes, values, part, table, c, factor, valid):
+    """Of a normal distribution with the median magnitude of the steady pixels' errors, within limits."""
     bins = np.zeros(_MOST_DEVIATION * _FINE, np.int64)
     for p in range(len(codes)):
-        if values[p, c] > 0:
+        if values[p, c] > 0 and part[p] < PARTS:
             place = int(abs(table[codes[p, c]] - factor * values[p, c]) * _f32(_FINE / LEVEL))
             if place < len(bins):
                 bins[place] += 1

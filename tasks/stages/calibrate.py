@@ -18,6 +18,7 @@ from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
 from packuv.files import save_json
+from packuv.footage import Light
 from sync.align import FrameGroups
 from sync.capture import Capture, find_capture
 from tasks.artefacts.stage import Files, Notes, Stage, Work
@@ -219,7 +220,8 @@ def store_of(store: Path, sequence: str) -> Path:
 class FindPoints(Stage):
     """Triangulate points and balance the colours: points.npz of the first instant, rig.json with gains, colour.json.
 
-    Only fitted cameras take part; the others keep a gain of 1.
+    Only fitted cameras take part; the others keep a gain of 1. Colours are those of steady light and exposure, so that
+    gains hold at every instant.
     """
 
     name, version = "points", 2
@@ -243,6 +245,7 @@ class FindPoints(Stage):
         except ValueError as problem:  # the rig was judged before: it is the scene that shows too little
             rig.save(work.out / RIG)
             return {"points": 0, "balanced": False, "reason": str(problem), "log_like": watch.suspects}
+        points = _steady(points, footage.load_light(), np.array(chosen), count)
         report = balance(points, options=options.balance)
         points.save(work.out / POINTS)
         with_gains(rig, report).save(work.out / RIG)
@@ -273,6 +276,15 @@ def complete_instants(groups: FrameGroups, cameras: tuple[str, ...], first: int)
             "film little under ignore in capture.toml, or give a calibration"
         )
     return found
+
+
+def _steady(points: SparsePoints, light: Light | None, chosen: np.ndarray, count: int) -> SparsePoints:
+    """Points of the instants `chosen` of `count`, with the colours that they have in steady light and exposure."""
+    factors = light.of(points.cameras, count) if light else None
+    if factors is None:
+        return points
+    changes = factors[chosen[points.instant[points.point]], points.camera]  # [M, 3]
+    return replace(points, colour=(points.colour / np.exp(changes)).astype(points.colour.dtype))
 
 
 def _lent(root: Path, rig: Files) -> Path:
