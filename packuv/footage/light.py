@@ -29,6 +29,8 @@ STEPS = 100_000
 """Logarithms are kept in steps of 1 / STEPS, as scene files hold them"""
 ROUNDS = 10
 """Levels and light in turn; cameras that start late settle within these"""
+FOLDS = 6
+"""Groups of cameras that are left out one after another"""
 FINEST = 0.001
 """Deviation between cameras below which none is doubted"""
 
@@ -224,27 +226,21 @@ def _filled(values: np.ndarray) -> np.ndarray:
 
 
 def _left_by_others(own: np.ndarray) -> float:
-    """Deviation of cameras over time that light from the others leaves, as a share of all of it; NaN of one camera.
+    """Deviation of a camera over time that light from others leaves, as a share of all of it; NaN of one camera.
 
-    Cameras are halved in two ways, and each half is explained by the other one.
+    A few cameras at a time are left out; of the shares of all cameras and channels, the median counts.
     """
     own = own[:, np.isfinite(own).any(axis=(0, 2))]
     count = own.shape[1]
     if count < 2:
         return float("nan")
-    before, after = [], []
-    for half in (np.arange(count) % 2 == 0, np.arange(count) < count // 2):
-        for side in (half, ~half):
-            light = common(own[:, side])
-            before += _spreads(own[:, ~side])
-            after += _spreads(own[:, ~side] - light[:, None])
-    whole = float(np.median(before))
-    return float(np.median(after)) / whole if whole > 0 else float("nan")
-
-
-def _spreads(own: np.ndarray) -> list[float]:
-    """Of each camera and channel."""
-    return [float(v) for v in _deviation(own, axis=0).ravel() if np.isfinite(v)]
+    shares = []
+    for fold in range(min(count, FOLDS)):
+        out = np.arange(count) % FOLDS == fold
+        light = common(own[:, ~out])
+        before, after = _deviation(own[:, out], axis=0), _deviation(own[:, out] - light[:, None], axis=0)  # [F, 3]
+        shares += (after[before > 0] / before[before > 0]).tolist()
+    return float(np.median(shares)) if shares else float("nan")
 
 
 def _deviation(values: np.ndarray, axis: int) -> np.ndarray:

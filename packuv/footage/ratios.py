@@ -125,7 +125,7 @@ def _reference(pictures: np.ndarray) -> _Reference | None:
             return None
         level = shown[known] / factors[known, None].astype(_f32)
         usual = np.median(level, axis=0)
-        steady = _steady(np.sqrt(((level - usual) ** 2).mean(axis=(0, 2))), counts.any(axis=1))
+        steady = _steady(np.sqrt(((level - usual) ** 2).mean(axis=(0, 2))), np.asarray(counts.any(axis=1)))
     # The mean of what agrees with the median is finer than a grey level.
     close = np.abs(level - usual) < 4 * LEVEL
     usual = np.divide(np.where(close, level, 0).sum(axis=0), close.sum(axis=0), out=usual, where=close.any(axis=0))

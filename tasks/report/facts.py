@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from calibration.accept import RigReport
 from calibration.rig import Rig
@@ -66,6 +67,35 @@ class MotionCurve:
         count = len(self.magnitude_px)
         if any(not 0 <= keyframe < count for keyframe in self.keyframes):
             raise ValueError(f"keyframes must be instants 0 to {count - 1}, but are {self.keyframes}")
+
+
+@dataclass(frozen=True)
+class LightCurve:
+    """How light and the cameras' own exposures change over time: natural logarithms of factors on linear light."""
+
+    light: np.ndarray
+    """float [T, 3]: of each instant, r g b; all 0 where it is steady"""
+    exposures: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """By camera float [T, 3], of those that have an exposure of their own"""
+    reason: str = ""
+    """Why the light is taken for steady"""
+
+    def __post_init__(self) -> None:
+        for name, own in {"light": self.light, **self.exposures}.items():
+            if own.shape != (len(self.light), 3):
+                raise ValueError(f"{name} must be {(len(self.light), 3)} as the light is, but is {own.shape}")
+
+    def jump(self, camera: str) -> tuple[float, int]:
+        """The largest change of a camera's exposure from some instants to the next ones, as a factor, and its instant.
+
+        Flicker is none: the medians of three instants before and after are compared.
+        """
+        level = self.exposures[camera].mean(axis=1)
+        around = np.pad(level, 3, mode="edge")
+        medians = np.median(sliding_window_view(around, 3), axis=1)  # of the three before each instant
+        steps = medians[3:-1] - medians[:-4]
+        worst = int((np.abs(steps) + 0.01 * np.abs(np.diff(level, prepend=level[:1]))).argmax())
+        return float(np.exp(steps[worst])), worst
 
 
 @dataclass(frozen=True)
@@ -159,6 +189,7 @@ class ReportInput:
     """By camera: how its video says that it codes colour, see `sync.probe.ColourTags`"""
     log_like: tuple[str, ...] = ()
     """Cameras whose pictures look like log footage that nobody called so"""
+    light: LightCurve | None = None
     motion: MotionCurve | None = None
     scores: tuple[FrameScore, ...] = ()
     """Of held-out cameras; of fitted ones where none was held out"""

@@ -24,6 +24,8 @@ class Limits:
     """95th percentile of the residuals, in frame periods: beyond it, moving things sit visibly elsewhere"""
     gain: float = 1.25
     """A colour gain above this, or below its inverse, is exposure that differs or a camera that sees little"""
+    exposure_jump: float = 1.1
+    """A camera's exposure that changes by more than this factor, or its inverse, at once: its automatic may be on"""
     camera_drop_db: float = 6.0
     """A camera this far below the median camera is calibrated, synchronized or balanced worse than the others"""
     frame_drop_db: float = 3.0
@@ -52,6 +54,7 @@ def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...
         *_run_findings(report),
         *_sync_findings(report, limits),
         *_rig_findings(report, limits),
+        *_light_findings(report, limits),
         *_score_findings(report, limits),
         *_scene_findings(report, limits),
     )
@@ -103,6 +106,14 @@ def _colour_findings(report: ReportInput) -> Iterator[Finding]:
         yield Finding(
             "colour", f'{names} {verb} like log footage; say which in capture.toml, such as transfer = "slog3".'
         )
+
+
+def _light_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
+    for camera in report.light.exposures if report.light else ():
+        factor, instant = report.light.jump(camera) if report.light else (1.0, 0)
+        if not 1 / limits.exposure_jump <= factor <= limits.exposure_jump:
+            text = f"The exposure of {camera} jumps by a factor of {factor:.2f} at frame {instant}"
+            yield Finding("light", f"{text}; fit and scores allow for it.")
 
 
 def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from sync.align import CameraReport, SyncReport
 from tasks.artefacts.recipe import plain
@@ -25,6 +26,7 @@ SECTIONS = {
     "sync": "Synchronization",
     "rig": "Camera layout",
     "colour": "Colour balance",
+    "light": "Light over time",
     "motion": "Motion and keyframes",
     "quality": "Quality over time",
     "pictures": "Truth, render, difference",
@@ -59,6 +61,7 @@ def sections(report: ReportInput, found: Sequence[Finding], limits: Limits) -> l
         "sync": _sync(report, limits),
         "rig": _rig(report),
         "colour": _colour(report),
+        "light": _light(report),
         "motion": _motion(report),
         "quality": _quality(report, limits),
         "pictures": _pictures(report),
@@ -143,6 +146,32 @@ def _colour(report: ReportInput) -> Body:
         return "All gains are 1: the cameras were not balanced, or did not need it."
     chart = gain_chart([camera.name for camera in report.rig.cameras], gains, title="Colour gains")
     return {"least": gains.min(), "most": gains.max(), "gains": chart}
+
+
+def _light(report: ReportInput) -> Body:
+    curve = report.light
+    if curve is None:
+        return "No light was measured: the stage did not run, or light.enabled is false."
+    if not curve.light.any() and not curve.exposures:
+        return f"Light and exposures are steady: {curve.reason}."
+    frames = range(len(curve.light))
+    lines = [
+        Series(name, frames, (100 * np.expm1(curve.light[:, channel])).tolist(), name)
+        for channel, name in enumerate(("red", "green", "blue"))
+    ]
+    own = [
+        Series(name, frames, (100 * np.expm1(values.mean(axis=1))).tolist(), f"s{number % 6 + 1}")
+        for number, (name, values) in enumerate(curve.exposures.items())
+    ]
+    return {
+        "reason": curve.reason,
+        "light": None if curve.reason else _change_chart(lines, "Light over time"),
+        "exposures": _change_chart(own, "Exposures over time") if own else None,
+    }
+
+
+def _change_chart(lines: Sequence[Series], title: str) -> Markup:
+    return line_chart(lines, title=title, x_label="frame", y_label="change, %")
 
 
 def _motion(report: ReportInput) -> Body:

@@ -67,6 +67,12 @@ def is_steady(folder: Path) -> bool:
     return bool(facts["steady"] and not facts["exposures"])
 
 
+def read_steady(folder: Path) -> str:
+    """Why the light is taken for steady; empty where it is not."""
+    facts = _read(folder)
+    return why_steady(facts) if facts["steady"] else ""
+
+
 def _range(light: np.ndarray) -> list[float]:
     """Least and most of any channel, as factors on linear light."""
     return [float(np.exp(light.min(initial=0))), float(np.exp(light.max(initial=0)))]

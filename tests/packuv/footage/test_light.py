@@ -1,4 +1,4 @@
-"""Light and exposures are found again from pictures that were made with them, and nothing is found where none changes."""
+"""Light and exposures are found again in pictures that were made with them, and none where nothing changes."""
 
 from __future__ import annotations
 
@@ -236,7 +236,9 @@ def test_pictures_are_read_from_videos_once(tmp_path: Path):
     for seed, name in enumerate(NAMES[:2]):
         shots = map(film(np.repeat(logs, 3, axis=1), seed), range(6))
         grey = [shot[..., 1] for shot in shots]
-        frames = [[16 + np.rint(g * (219 / 255)).astype(np.uint8), *[np.full(g.shape, 128, np.uint8)] * 2] for g in grey]
+        frames = [
+            [16 + np.rint(g * (219 / 255)).astype(np.uint8), *[np.full(g.shape, 128, np.uint8)] * 2] for g in grey
+        ]
         write_planes(tmp_path / f"{name}.mkv", "yuv444p", frames, (1, 1, 2, 1))
     reader = Counting({name: tmp_path / f"{name}.mkv" for name in NAMES[:2]})
     numbers = {"cam00": np.arange(6), "cam01": np.array([0, 1, 2, -1, 4, 5])}
