@@ -31,6 +31,8 @@ ROUNDS = 10
 """Levels and light in turn; cameras that start late settle within these"""
 FOLDS = 6
 """Groups of cameras that are left out one after another"""
+JUDGED = 4000
+"""Instants, spread over the recording, by which light is judged, at most"""
 FINEST = 0.001
 """Deviation between cameras below which none is doubted"""
 
@@ -183,10 +185,12 @@ def common(own: np.ndarray) -> np.ndarray:
     own = own[:, known.any(axis=(0, 2))]
     if not own.shape[1]:
         return np.zeros((len(own), 3))
-    light = np.zeros((len(own), 1, 3))
+    light = np.zeros((len(own), 1, 3), own.dtype)
     for _ in range(ROUNDS):
-        levels = _centre(own - light, axis=0)
+        before, levels = light, _centre(own - light, axis=0)
         light = _filled(_centre(own - levels, axis=1)[:, 0])[:, None]
+        if np.abs(light - before).max(initial=0) < 1 / STEPS:
+            break
     flat = light[:, 0]
     return np.asarray(flat - flat.mean(axis=0))
 
@@ -230,7 +234,7 @@ def _left_by_others(own: np.ndarray) -> float:
 
     A few cameras at a time are left out; of the shares of all cameras and channels, the median counts.
     """
-    own = own[:, np.isfinite(own).any(axis=(0, 2))]
+    own = own[:: 1 + len(own) // JUDGED, np.isfinite(own).any(axis=(0, 2))]
     count = own.shape[1]
     if count < 2:
         return float("nan")

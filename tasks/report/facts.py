@@ -86,16 +86,17 @@ class LightCurve:
                 raise ValueError(f"{name} must be {(len(self.light), 3)} as the light is, but is {own.shape}")
 
     def jump(self, camera: str) -> tuple[float, int]:
-        """The largest change of a camera's exposure from some instants to the next ones, as a factor, and its instant.
+        """The largest change of a camera's exposure from four instants to the next four, as a factor, and where.
 
-        Flicker is none: the medians of three instants before and after are compared.
+        Flicker, which comes back at once, is next to none.
         """
-        level = self.exposures[camera].mean(axis=1)
-        around = np.pad(level, 3, mode="edge")
-        medians = np.median(sliding_window_view(around, 3), axis=1)  # of the three before each instant
-        steps = medians[3:-1] - medians[:-4]
-        worst = int((np.abs(steps) + 0.01 * np.abs(np.diff(level, prepend=level[:1]))).argmax())
-        return float(np.exp(steps[worst])), worst
+        level, length = self.exposures[camera].mean(axis=1), min(4, len(self.light) // 2)
+        if not length:
+            return 1.0, 0
+        means = sliding_window_view(level, length).mean(axis=1)
+        steps = means[length:] - means[:-length]
+        worst = int(np.abs(steps).argmax())
+        return float(np.exp(steps[worst])), worst + length
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ def why_steady(facts: Notes) -> str:
         return "fewer than two fitted cameras tell it, so none confirms the other"
     if spread < facts["least"]:
         return f"it changes by {spread:.2%}, less than {facts['least']:.2%}"
-    return f"what some cameras see of it leaves {left:.0%} of the change that the others see"
+    return f"light that some cameras see leaves {left:.0%} of the change that others see"
 
 
 def is_steady(folder: Path) -> bool:

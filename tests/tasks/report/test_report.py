@@ -340,7 +340,7 @@ def test_bad_colours_scores_files_and_stages_are_named() -> None:
 def test_a_camera_whose_exposure_jumps_is_named() -> None:
     assert make_light(1.25).jump("cam2") == (pytest.approx(1.25), 5)
     assert texts(replace(make_report(), light=make_light(0.8))) == [
-        "The exposure of cam2 jumps by a factor of 0.80 at frame 5; fit and scores allow for it."
+        "light: The exposure of cam2 jumps by a factor of 0.80 at frame 5; fit and scores allow for it."
     ]
     flicker = {"cam2": 0.2 * (-1.0) ** np.arange(FRAMES)[:, None] * np.ones(3)}
     assert texts(replace(make_report(), light=replace(make_light(), exposures=flicker))) == []
