@@ -2,7 +2,8 @@
 
     python examples/decode_to_tensors.py SCENE.mkv
 
-Frames come as float32 arrays in the conventions of 3D Gaussian Splatting; `torch.from_numpy` shares their memory.
+Frames come as float32 arrays in the conventions of 3D Gaussian Splatting; `torch.from_numpy` shares their memory. They
+are those of steady light: `packuv.gaussians.floats.lit_gaussians` with `scene.light(number)` shows them as filmed.
 """
 
 import sys

@@ -26,6 +26,8 @@ MOST_GAUSSIANS = 2**26
 MOST_CAMERAS = 10_000
 MOST_FRAMES = 2**18
 """Of a scene, 2.4 hours at 30 a second; their part of the header stays below MOST_JSON_BYTES"""
+MOST_LIT_FRAMES = 216_000
+"""Of a scene whose light changes, 2 hours at 30 a second: three numbers more for each"""
 MOST_REFERENCES = 64
 """Keys that are decoded for one key"""
 MOST_NUMBER = 1e30
@@ -38,8 +40,8 @@ MOST_RATE_PART = 2**31 - 1
 """Numerator and denominator of a frame rate: FFmpeg's"""
 MOST_TEXT = 1000
 """Characters of a name"""
-MOST_JSON_BYTES = 32 << 20
-MOST_JSON_VALUES = 10 * MOST_FRAMES
+MOST_JSON_BYTES = 24 << 20
+MOST_JSON_VALUES = 2**21
 """Commas and opening brackets of a JSON document; Python takes up to 200 bytes for a value"""
 MOST_JSON_DEPTH = 64
 ALWAYS_UNPACKED_BYTES, MOST_RATIO = 16 << 20, 64

@@ -80,7 +80,7 @@ def lit_gaussians(gaussians: Gaussians, light: np.ndarray) -> Gaussians:
     factors = light_factors(light)
     sh = gaussians.sh * factors
     sh[:, 0] += (factors - 1) * (0.5 + OFFSET) / SH_C0
-    return replace(gaussians, sh=sh.astype(np.float32))
+    return replace(gaussians, sh=np.ascontiguousarray(sh, np.float32))
 
 
 def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:

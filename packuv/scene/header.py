@@ -139,6 +139,8 @@ def _checked_light(light: np.ndarray, frames: int) -> np.ndarray:
         raise ValueError(f"light must be {(frames, 3)}, r g b of each frame, but is {light.shape}")
     if not (np.abs(light) <= bounds.MOST_LIGHT).all():
         raise ValueError(f"light must hold natural logarithms within {bounds.MOST_LIGHT:g} of 0")
+    if frames > bounds.MOST_LIT_FRAMES and light.any():
+        raise ValueError(f"a scene whose light changes has at most {bounds.MOST_LIT_FRAMES} frames, not {frames}")
     return _light_steps(light) / LIGHT_STEPS
 
 

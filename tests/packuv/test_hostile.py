@@ -68,9 +68,10 @@ def test_depth_is_that_of_lists_and_objects():
 
 
 def test_the_header_of_the_longest_scene_fits():
-    """A frame's time, digest, size, checksum, prediction, form and light, and their commas; a segment for 30 of them."""
-    light = "-1000000," * 3
-    frame = f'{10**18},"{"f" * 32}",{10**7},{2**32 - 1},2,1,{light}'
+    """A frame's time, digest, size, checksum, prediction, form, light, and their commas; a segment for 30 of them."""
+    steady = f'{10**18},"{"f" * 32}",{10**7},{2**32 - 1},2,1,'
+    lit = f"{steady}{'-1000000,' * 3}"
     segment = json.dumps(dict.fromkeys(("differences", "dynamic", "first", "first_packet"), 10**6)) * 3
-    assert bounds.MOST_FRAMES * (len(frame) + len(segment) / 30) < bounds.MOST_JSON_BYTES
-    assert bounds.MOST_FRAMES * (frame.count(",") + segment.count(",") / 30) < bounds.MOST_JSON_VALUES
+    for frames, frame in ((bounds.MOST_FRAMES, steady), (bounds.MOST_LIT_FRAMES, lit)):
+        assert frames * (len(frame) + len(segment) / 30) < bounds.MOST_JSON_BYTES
+        assert frames * (frame.count(",") + segment.count(",") / 30) < bounds.MOST_JSON_VALUES

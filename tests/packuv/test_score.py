@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from fractions import Fraction
 
+import av
+import numpy as np
 import pyarrow as pa
+import pytest
 
-from packuv.score import FIGURES, SCHEMA, Score
+from packuv.camera import PinholeCamera
+from packuv.colour import lit
+from packuv.footage import LensCamera, Views
+from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Quantizer, attribute_values
+from packuv.gaussians.floats import with_canonical_axes
+from packuv.gaussians.segment import Segment
+from packuv.progress import no_progress
+from packuv.scene import SceneHeader, open_scene, write_scene
+from packuv.score import FIGURES, SCHEMA, Artist, Score, score
+from tests.support.splats import wall
 
 
 def test_the_table_has_the_columns_that_stores_hold():
@@ -30,3 +43,57 @@ def test_the_table_has_the_columns_that_stores_hold():
 def test_every_field_is_a_column_and_every_figure_has_a_mean():
     assert SCHEMA.names == [field.name for field in fields(Score)]
     assert FIGURES == ("psnr_db", "ssim", "psnr_calibrated_db", "ssim_calibrated", "psnr_own_db", "ssim_own", "flicker")
+
+
+# In light that changes
+
+CAMERA = PinholeCamera("a", 96, 64, 70.0, 70.0, 48.0, 32.0, np.eye(4))
+LIGHT = np.array([[0.0, 0, 0], [0.4, 0.1, -0.2], [-0.6, -0.6, -0.5]])
+
+
+def write_wall(path, light):
+    """Three equal frames, and what the header says of their light."""
+    gaussians = with_canonical_axes(wall(0))
+    values = attribute_values(gaussians)
+    low, high = values.min(axis=0).astype(float) - 1e-3, values.max(axis=0).astype(float) + 1e-3
+    low[OPACITY], high[OPACITY] = OPACITY_RANGE
+    quantizer = Quantizer(np.array([0, 0, 4.0]), 1.0, np.full(3, 5.0), low, high)
+    key = quantizer.encode(gaussians)
+    still = np.empty((2, 0, 3), np.uint16), np.empty((2, 0, key.attributes.shape[1]), np.uint8)
+    Segment(0, key, np.zeros(len(key), bool), *still).save(path.with_suffix(".npz"))
+    times = np.arange(3, dtype=np.int64) * 40_000_000
+    header = SceneHeader(quantizer, times, Fraction(25), (CAMERA,), extra={"near": 0.1})
+    write_scene(path, [path.with_suffix(".npz")], replace(header, light=light))
+    return path
+
+
+def film(path, pictures):
+    """Lossless video of float32 pictures [3, H, W]."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264rgb", rate=25)
+        stream.width, stream.height, stream.pix_fmt, stream.options = 96, 64, "rgb24", {"qp": "0"}
+        for picture in pictures:
+            pixels = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")))
+        container.mux(stream.encode(None))
+
+
+def scores_of(path, video, light):
+    views = Views({"a": video}, np.arange(3)[:, None], [LensCamera(CAMERA)], light=light)
+    with open_scene(path) as scene:
+        return score(scene, views, no_progress)
+
+
+def test_raw_scores_are_those_of_the_scene_in_its_light(tmp_path):
+    path, steady = write_wall(tmp_path / "lit.mkv", LIGHT), write_wall(tmp_path / "steady.mkv", 0 * LIGHT)
+    with open_scene(path) as scene:
+        drawn = Artist(scene).draw(scene.gaussians(0), CAMERA)
+    film(tmp_path / "a.mp4", [lit(drawn, light) for light in LIGHT])
+    for one in scores_of(path, tmp_path / "a.mp4", None):
+        assert one.psnr_db > 55  # 8 bits
+    # A plain camera whose exposure is steady: what it makes of the picture is the light of the scene.
+    for one in scores_of(path, tmp_path / "a.mp4", LIGHT[:, None]):
+        assert one.psnr_calibrated_db == pytest.approx(one.psnr_db, abs=0.01)
+    raw = [one.psnr_db for one in scores_of(steady, tmp_path / "a.mp4", LIGHT[:, None])]
+    assert raw[0] > 55
+    assert max(raw[1:]) < 30

@@ -349,8 +349,8 @@ def write_worst(folder: Path) -> None:
     maker.write_text(folder / "nested.mkv", nested)
     maker.write_text(folder / "nested-lists.mkv", b"[" * 3_000_000)
     maker.write_text(folder / "many-values.mkv", b"[" + b"{}," * 3_000_000 + b"0]")
-    maker.write_text(folder / "large.mkv", b'{"a":"' + b"x" * (33 << 20) + b'"}')
-    maker.write_text(folder / "wide-text.mkv", b'{"a":"' + b"x" * (28 << 20) + "\U0001f600".encode() + b'"}')
+    maker.write_text(folder / "large.mkv", b'{"a":"' + b"x" * (25 << 20) + b'"}')
+    maker.write_text(folder / "wide-text.mkv", b'{"a":"' + b"x" * (20 << 20) + "\U0001f600".encode() + b'"}')
     chained = copy.deepcopy(maker.document)
     chained["segments"] = [{**chained["segments"][1], "reference": k - 1 if k else None} for k in range(5000)]
     maker.write(folder / "chain.mkv", chained)

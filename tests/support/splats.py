@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.floats import SH_C0, Gaussians
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 
@@ -13,6 +13,16 @@ def random_gaussians(count, degree, seed=0):
     means, scales, quaternions, opacity, sh = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     return Gaussians(means, scales, quaternions, opacity, sh)
+
+
+def wall(degree):
+    """Large opaque Gaussians that cover a picture from the origin along z, of colours far from both limits."""
+    rng, count = np.random.default_rng(0), 600
+    means = rng.uniform([-4, -3, 3], [4, 3, 5], (count, 3))
+    sh = rng.uniform(-0.02, 0.02, (count, (degree + 1) ** 2, 3))
+    sh[:, 0] = (rng.uniform(0.15, 0.65, (count, 3)) - 0.5) / SH_C0
+    values = means, np.full((count, 3), np.log(0.4)), rng.normal(size=(count, 4)), np.full(count, 6.0), sh
+    return Gaussians(*(value.astype(np.float32) for value in values))
 
 
 def alpha_of(gaussians):

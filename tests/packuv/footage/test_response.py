@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
-from packuv.colour import linear_from_srgb, srgb_from_linear
+from packuv.colour import linear_from_srgb, lit, srgb_from_linear
 from packuv.footage.lens import LensCamera
 from packuv.footage.response import Response, corner_radius, shading_means
 
@@ -40,6 +40,13 @@ def falloff(k1: float, k2: float) -> np.ndarray:
 def test_without_gain_shading_and_light_a_picture_is_filmed_as_it_is():
     response = Response.of(LensCamera(PINHOLE), PINHOLE)
     assert np.allclose(response.shown(PICTURE), PICTURE, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(st.tuples(*[st.floats(-2, 1)] * 3).map(np.array))
+def test_a_plain_camera_films_the_lit_picture(light):
+    response = Response.of(LensCamera(PINHOLE), PINHOLE, light)
+    assert np.abs(response.shown(PICTURE) - np.clip(lit(PICTURE, light), 0, 1)).max() < 1e-6  # float32
 
 
 @settings(deadline=None)

@@ -12,6 +12,7 @@ import re
 import shutil
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
+from packuv.colour import lit
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.raster import RasterOptions, render
@@ -67,7 +69,7 @@ def random_codes(rng, count, degree):
     return Codes(rng.integers(0, 65536, (count, 3), np.uint16), rng.integers(1, 256, (count, columns), np.uint8))
 
 
-def write_random_scene(path, *, degree=0, rows=(500, 300, 7), frames=(3, 2, 1), seed=0):
+def write_random_scene(path, *, degree=0, rows=(500, 300, 7), frames=(3, 2, 1), seed=0, light=None):
     rng = np.random.default_rng(seed)
     parts, first = [], 0
     for number, (count, length) in enumerate(zip(rows, frames, strict=True)):
@@ -82,7 +84,8 @@ def write_random_scene(path, *, degree=0, rows=(500, 300, 7), frames=(3, 2, 1), 
         Segment(first, key, np.arange(count) < moving, xyz, attributes).save(parts[-1])
         first += length
     times = np.array([index * 10**9 // 30 for index in range(first)], dtype=np.int64)
-    write_scene(path, parts, SceneHeader(quantizer(degree), times, Fraction(30), ring(), extra={"near": 0.1}))
+    header = SceneHeader(quantizer(degree), times, Fraction(30), ring(), extra={"near": 0.1})
+    write_scene(path, parts, header if light is None else replace(header, light=light))
     return path
 
 
@@ -223,6 +226,16 @@ def test_damage_is_told(sites, tmp_path, file):
         read_index(folder)
 
 
+def test_only_a_scene_whose_light_changes_says_so(sites, tmp_path):
+    light = np.linspace(-0.5, 0.5, 18).reshape(6, 3).round(5)
+    write_web(write_random_scene(tmp_path / "a.mkv", light=light), tmp_path / "a", options=WebOptions())
+    told, plain = (json.loads((folder / "scene.json").read_text()) for folder in (tmp_path / "a", sites[WebCodec.VP9]))
+    assert np.array_equal(told.pop("light"), light)
+    assert told == plain
+    for name in ("index.json", "key.ivf", "delta.ivf", "segment00000.bin", "tables.bin"):
+        assert (tmp_path / "a" / name).read_bytes() == (sites[WebCodec.VP9] / name).read_bytes()  # codes are steady
+
+
 # In a browser
 
 
@@ -289,6 +302,27 @@ def test_the_page_draws_the_scene_behind_any_web_server(browser, scene_path, sit
     else:
         assert all(asked.count(name) <= 1 for name in names)  # each whole file once, whoever asks
         assert sum("range" in path for path in asked) == 1  # to find out
+
+
+@pytest.mark.slow
+def test_the_page_in_a_folder_shows_a_frame_in_its_light(browser, tmp_path):
+    light = np.zeros((6, 3))
+    light[4] = [0.6, 0, -0.8]
+    path, camera = write_random_scene(tmp_path / "a.mkv", rows=(4000, 4000, 7), light=light), ring()[1]
+    write_web(path, tmp_path / "a", options=WebOptions())
+    with served(tmp_path / "a", ranges=True) as (address, _):
+        browser.open(
+            f"{address}#bare=1&play=0&frame=4&camera={camera.name}&background=0,0,0", camera.width, camera.height
+        )
+        browser.wait_for("document.documentElement.dataset.frame == 4")
+        shown = browser.picture().astype(np.float64).transpose(2, 0, 1) / 255
+    with open_scene(path) as scene:
+        drawn = render(scene.gaussians(4), camera, options=RasterOptions(near=0.1))
+        wanted = np.clip(lit(drawn.colour, scene.light(4)), 0, 1)  # what `packuv render` writes
+    covered = drawn.alpha > 0.99
+    assert covered.mean() > 0.2
+    assert -10 * np.log10(np.mean((shown - wanted)[:, covered] ** 2)) > 50  # as in steady light
+    assert -10 * np.log10(np.mean((shown - np.clip(drawn.colour, 0, 1))[:, covered] ** 2)) < 30
 
 
 SUMS = """

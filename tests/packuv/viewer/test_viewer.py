@@ -25,6 +25,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
+from packuv.colour import lit
 from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.raster import RasterOptions, render
@@ -44,6 +45,7 @@ from packuv.viewer.source import (
 )
 from tests.support.browser import Browser, running_browser
 
+NEAR = RasterOptions(near=0.1)
 PAGE_FOLDER = Path(viewer_server.__file__).parent
 
 
@@ -424,6 +426,50 @@ def test_the_page_draws_what_the_rasterizer_draws(browser: Browser, sh_degree: i
     # 8 bits alone allow 59 dB; half floats and depth ties inside 1/4096 take the rest. Measured: see docs/viewer.md.
     assert -10 * np.log10(np.mean(error**2)) > 52
     assert wanted.std() > 0.1  # there is something to compare
+
+
+LIGHT = np.array([[0, 0, 0], [0.3, -0.2, 0], [0, 0, 0], [-0.9, 0, 0.4], [0.1, 0.1, 0.1], [0, 0, 0], [0.5, -0.4, 0.1]])
+
+
+class Lit(SegmentSource):
+    """Frames in light of their own."""
+
+    @property
+    def light(self) -> np.ndarray:
+        return np.concatenate([LIGHT, np.zeros((1, 3))])
+
+
+def test_the_page_is_told_light_where_it_is_not_steady() -> None:
+    source = make_source()
+    assert "light" not in describe(source)
+    told = json.loads(json.dumps(describe(Lit(source.parts, source.quantizer))))
+    assert np.array_equal(told["light"][:7], LIGHT)
+
+
+@pytest.mark.slow
+def test_the_page_shows_every_frame_in_its_light(browser: Browser) -> None:
+    plain = make_source(1, count=6000)
+    source = Lit(plain.parts, plain.quantizer, plain.rate, plain.cameras, near=0.1)
+    camera, background = source.cameras[2], (0.2, 0.4, 0.6)
+    with running(source) as server:
+        wish = f"bare=1&play=0&frame=6&camera={camera.name}&background={','.join(map(str, background))}"
+        browser.open(f"{server.url}#{wish}", camera.width, camera.height)
+        for frame, key in ((6, ""), (7, "ArrowRight"), (6, "ArrowLeft"), (0, "Home"), (1, "ArrowRight")):
+            if key:
+                browser.evaluate(f"dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))")
+            browser.wait_for(f"document.documentElement.dataset.frame == {frame}")
+            shown = browser.picture().astype(np.float64).transpose(2, 0, 1) / 255
+            part = source.parts[0 if frame < 4 else 2]
+            drawn = render(source.quantizer.decode(part.frame(frame - part.first)), camera, options=NEAR)
+            rest = 1 - drawn.alpha
+            # The page's background is no part of the scene: light leaves it alone, and so what shines through.
+            wanted = lit(drawn.colour, source.light[frame]) - rest * lit(np.zeros((3, 1, 1)), source.light[frame])
+            wanted = np.clip(wanted + rest * np.array(background)[:, None, None], 0, 1)
+            assert -10 * np.log10(np.mean((shown - wanted) ** 2)) > 50  # as in steady light
+            covered = drawn.alpha > 0.99
+            assert covered.sum() > 1000
+            seen = np.clip(lit(drawn.colour, source.light[frame]), 0, 1)  # what `packuv render` writes
+            assert -10 * np.log10(np.mean((shown - seen)[:, covered] ** 2)) > 45
 
 
 @pytest.mark.slow

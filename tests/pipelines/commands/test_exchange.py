@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 
 import cv2
@@ -12,11 +13,13 @@ import pytest
 from calibration.importers import load_rig
 from packuv.atlas import AtlasVideo
 from packuv.camera import PinholeCamera
+from packuv.colour import lit
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer
-from packuv.gaussians.floats import drawn
+from packuv.gaussians.floats import drawn, lit_gaussians
 from packuv.gaussians.segment import Segment
 from packuv.interchange import read_gaussians
 from packuv.scene import SceneHeader, open_scene, write_scene
+from packuv.score import Artist
 from pipelines.cli import OK, WRONG, main
 
 ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
@@ -33,7 +36,7 @@ def cameras(square):
     )
 
 
-def write_small_scene(path, *, square=True):
+def write_small_scene(path, *, square=True, light=None):
     rng = np.random.default_rng(0)
     low, high = np.full(10, -3.0), np.full(10, 1.0)
     low[3:6], high[3:6] = -0.71, 0.71
@@ -47,6 +50,7 @@ def write_small_scene(path, *, square=True):
     Segment(0, key, moving, xyz, attributes).save(path.with_suffix(".npz"))
     times = np.array([0, 33_000_000, 67_000_000], dtype=np.int64)
     header = SceneHeader(quantizer, times, Fraction(30), cameras(square), extra={"near": 0.05})
+    header = header if light is None else replace(header, light=light)
     write_scene(path, [path.with_suffix(".npz")], header)
     path.with_suffix(".npz").unlink()
     return path
@@ -55,6 +59,15 @@ def write_small_scene(path, *, square=True):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     return write_small_scene(tmp_path_factory.mktemp("exchange") / "a.mkv")
+
+
+LIGHT = np.array([[0.0, 0, 0], [0.3, -0.2, 0.1], [-1.5, 0.05, 0.6]])
+
+
+@pytest.fixture(scope="module")
+def lit_scene(tmp_path_factory):
+    """The same scene in light that changes."""
+    return write_small_scene(tmp_path_factory.mktemp("lit") / "a.mkv", light=LIGHT)
 
 
 def run(*words):
@@ -100,6 +113,55 @@ def test_a_sequence_goes_out_and_comes_back(scene, tmp_path, capsys):
             assert np.abs(a.means[order[0]] - b.means[order[1]]).max() < 1e-3
     assert run("import", tmp_path / "frames", "--keep-all", "-o", tmp_path / "c.mkv") == OK
     assert "the UV map has no texel for 0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["--frame", 2, "-o", "a.ply"], ["--frames", "2:3", "-o", "a"]])
+def test_a_frame_goes_out_as_it_is_seen_in_its_light(scene, lit_scene, tmp_path, words, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("export", lit_scene, *words) == OK
+    back = read_gaussians(next(path for path in tmp_path.rglob("*.ply") if path.is_file()))
+    with open_scene(scene) as opened:
+        truth = lit_gaussians(drawn(opened.gaussians(2)), LIGHT[2])
+    assert all(np.array_equal(getattr(back, name), getattr(truth, name)) for name in ATTRIBUTES)
+
+
+def test_pictures_are_drawn_in_the_light_of_their_frame(scene, lit_scene, tmp_path):
+    for path, folder in ((scene, "steady"), (lit_scene, "lit")):
+        assert run("render", path, "--camera", "b", "-o", tmp_path / folder) == OK
+    for frame in range(3):
+        steady, seen = (cv2.imread(str(tmp_path / name / f"{frame:06d}.png")) for name in ("steady", "lit"))
+        with open_scene(scene) as opened:
+            picture = lit(Artist(opened).draw(opened.gaussians(frame), cameras(True)[0]), LIGHT[frame])
+        wanted = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8).transpose(1, 2, 0)[..., ::-1]
+        assert np.array_equal(seen, wanted)
+        assert np.array_equal(seen, steady) == (frame == 0)
+
+
+def test_the_command_tells_that_light_changes(scene, lit_scene, capsys):
+    assert run("info", lit_scene) == OK
+    assert "light      22.3% to 182.2% of steady light" in capsys.readouterr().out
+    assert run("info", scene) == OK
+    assert "light" not in capsys.readouterr().out
+
+
+def test_an_atlas_video_keeps_codes_and_light_apart(lit_scene, tmp_path):
+    assert run("export", "atlas", lit_scene, "--map", 64, "-o", tmp_path / "a.mkv") == OK
+    assert np.array_equal(AtlasVideo(tmp_path / "a.mkv").header.light, LIGHT)
+    assert run("import", tmp_path / "a.mkv", "-o", tmp_path / "back.mkv") == OK
+    with open_scene(tmp_path / "back.mkv") as back, open_scene(lit_scene) as first:
+        assert np.array_equal(back.light(2), LIGHT[2])
+        a, b = (drawn(scene.gaussians(2)).means for scene in (back, first))
+        assert np.array_equal(a[np.lexsort(a.T)], b[np.lexsort(b.T)])
+
+
+def test_the_sheet_shows_colours_in_the_light_of_the_frame(scene, lit_scene, tmp_path):
+    pages = []
+    for number, path in enumerate((scene, lit_scene, scene, lit_scene)):
+        page = tmp_path / f"{number}.png"
+        assert run("atlas", path, "--frame", number // 2, "--map", 64, "--layers", 4, "-o", page) == OK
+        pages.append(cv2.imread(str(page)))
+    assert np.array_equal(pages[0], pages[1])  # frame 0, steady
+    assert (pages[2] != pages[3]).any()
 
 
 @pytest.mark.parametrize(("to", "file"), [("colmap", "images.txt"), ("transforms", "transforms.json")])

@@ -10,15 +10,16 @@ import pytest
 
 from packuv.fit.keyframe import KeyState
 from packuv.fit.start.bounds import Bounds
+from packuv.footage import Light
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
 from sync.align import AlignOptions, align
 from sync.timecode import Timecodes
 from tasks.artefacts.stage import Site
-from tasks.stages.encode import SCENE, Encode, Verify
+from tasks.stages.encode import SCENE, Encode, Verify, scene_header
 from tasks.stages.fitting import SEGMENT
-from tasks.stages.footage import RIG, Take
+from tasks.stages.footage import RIG, Footage, Take
 from tests.support.artefacts import build_here, put
 from tests.support.calibration_scene import ring
 
@@ -104,6 +105,13 @@ def test_the_scene_says_how_it_was_filmed(site, take, key, fitted, tmp_path):
         assert [camera.name for camera in scene.header.cameras] == ["cam00", "cam01", "cam02"]
         assert scene.header.held_out == ("cam01",)
         assert scene.header.extra["near"] == 0.1
+
+
+def test_the_header_takes_light_of_the_instants(site, take, key):
+    footage, state = Footage(take, site), KeyState.load(site.path(key))
+    light = np.linspace(-0.2, 0.2, 18).reshape(6, 3).round(5)
+    assert np.array_equal(scene_header(footage, (), state, Light(light.astype(np.float32))).light, light)
+    assert not scene_header(footage, (), state).light.any()
 
 
 def test_what_is_fitted_so_far_plays_and_grows_into_the_whole(site, take, key, fitted, tmp_path):
