@@ -38,21 +38,27 @@ def balance_held_out(
     report: ColourReport,
     instants: Sequence[Mapping[str, np.ndarray]],
     *,
+    light: np.ndarray | None = None,
     patch_px: int,
     options: BalanceOptions,
 ) -> ColourReport:
     """The report with gains and shading of the cameras of `rig` that `points` lack.
 
     `instants` are pictures of all cameras as filmed, uint8 [H, W, 3] RGB, one mapping per instant of the points; an
-    instant may lack cameras. A camera with fewer than `min_observations`, or one that agrees no better, keeps gain 1.
+    instant may lack cameras. `light`, float [instants, cameras, 3], is the natural logarithm of what the light of the
+    instant and a camera's exposure make of light, which the points' colours lack; None where both are steady. A camera
+    with fewer than `min_observations`, or one that agrees no better, keeps gain 1.
     """
     fitted = rig.select(points.cameras)
     colours = log_colours(fitted, points, report)
     usable = np.isfinite(colours).all(axis=1)
     views = [_Instant.of(fitted, points, index, pictures, usable) for index, pictures in enumerate(instants)]
-    for camera in rig.cameras:
+    for number, camera in enumerate(rig.cameras):
         if camera.name not in points.cameras:
-            seen = _joined([view.seen_by(camera, patch_px, options) for view in views])
+            parts = [view.seen_by(camera, patch_px, options) for view in views]
+            if light is not None:
+                parts = [part.lit(-change) for part, change in zip(parts, light[:, number], strict=True)]
+            seen = _joined(parts)
             report = _with_camera(report, camera, seen, colours[seen.point], options)
     return report
 
@@ -67,6 +73,10 @@ class _Seen:
     """float64 [N, 3], natural logarithm of linear light"""
     basis: np.ndarray
     """float64 [N, 2], of the shading"""
+
+    def lit(self, change: np.ndarray) -> _Seen:
+        """In light that differs by exp(`change`), float [3]."""
+        return replace(self, log=self.log + change)
 
     def only(self, kept: np.ndarray) -> _Seen:
         return _Seen(self.point[kept], self.log[kept], self.basis[kept])

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from packuv.fit.options import FitOptions
-from packuv.footage import Transfer
+from packuv.footage import LightOptions, Transfer
 from packuv.motion import KeyframeOptions, MotionOptions
 from packuv.scene import TOLERANCES, EncodeOptions, Quality
 from pipelines.request import PRESETS, QUALITIES
@@ -26,6 +26,7 @@ class SequenceOptions:
     pictures: PictureOptions = field(default_factory=PictureOptions)
     sync: AlignOptions = field(default_factory=AlignOptions)
     rig: RigOptions = field(default_factory=RigOptions)
+    light: LightOptions = field(default_factory=LightOptions)
     points: PointOptions = field(default_factory=PointOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)

@@ -17,6 +17,7 @@ import numpy as np
 import packuv
 from calibration.accept import RigReport
 from calibration.rig import Rig
+from packuv.footage import Light
 from packuv.scene import open_scene
 from packuv.score import read_table
 from pipelines.events import Event, Journal
@@ -28,13 +29,22 @@ from tasks.artefacts.jobs import CancelledError
 from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
-from tasks.report.facts import Comparison, MotionCurve, ReportInput, SceneFigures, StageRecord, scene_figures
+from tasks.report.facts import (
+    Comparison,
+    LightCurve,
+    MotionCurve,
+    ReportInput,
+    SceneFigures,
+    StageRecord,
+    scene_figures,
+)
 from tasks.report.write import JSON_NAME, PAGE_NAME
 from tasks.stages.calibrate import CHECK
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
 from tasks.stages.fitting import REFUSED
-from tasks.stages.footage import RIG
+from tasks.stages.footage import LIGHT, RIG
+from tasks.stages.light import read_steady
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import read_videos
 from tasks.stages.track import read_curve, read_keyframes
@@ -139,6 +149,7 @@ def collect(run: Run) -> ReportInput:
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
         unlike=_points_notes(run).get("unlike", {}),
         log_like=tuple(_points_notes(run).get("log_like", ())),
+        light=_light(run.folder("light")),
         motion=_curve(run.folder("keyframes")),
         scores=_scores(run.folder("evaluate")),
         scene=_scene(run),
@@ -159,6 +170,13 @@ def _check(run: Run) -> RigReport | None:
 def _points_notes(run: Run) -> Mapping[str, Any]:
     points = run.made.get("points")
     return run.workshop.store.receipt(points).notes if points else {}
+
+
+def _light(folder: Path | None) -> LightCurve | None:
+    if folder is None:
+        return None
+    light = Light.load(folder / LIGHT)
+    return LightCurve(light.light, light.exposures, read_steady(folder))
 
 
 def _curve(folder: Path | None) -> MotionCurve | None:

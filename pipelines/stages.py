@@ -24,6 +24,7 @@ from tasks.stages.encode import Encode, Verify
 from tasks.stages.evaluate import Evaluate, scored_cameras
 from tasks.stages.fitting import background_of
 from tasks.stages.footage import Take
+from tasks.stages.light import MeasureLight, is_steady
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.synchronize import synchronize
@@ -102,6 +103,7 @@ class Sequence:
         return Take(
             groups=self.made.only("sync"),
             rig=self.made.only(rig),
+            light=self._light(),
             cameras=self.plan.fitted,
             first=self.plan.first,
             stop=self.plan.stop,
@@ -117,8 +119,19 @@ class Sequence:
         groups, plan = self.made.only("sync"), self.plan
         rig = self._place()
         pictures = self.options.pictures.as_filmed
-        take = Take(groups=groups, rig=rig, cameras=tuple(plan.videos), first=plan.first, pictures=pictures)
+        filmed = Take(groups=groups, cameras=tuple(plan.videos), first=plan.first, pictures=pictures)
+        if self.options.light.enabled:
+            take = replace(filmed, stop=plan.stop)
+            self._make(MeasureLight(take=take, fitted=plan.fitted, options=self.options.light))
+        else:
+            self.workshop.listener.skipped("light", "light.enabled is false")
+        take = replace(filmed, rig=rig, light=self._light())
         self._make(FindPoints(take=take, fitted=plan.fitted, options=self.options.points))
+
+    def _light(self) -> Key | None:
+        """Light and exposures over time; None where they are steady, so that nothing depends on how that was found."""
+        key = self.made.get("light")
+        return None if key is None or is_steady(self.workshop.path(key)) else key
 
     def _place(self) -> Key:
         """The rig: this take's own, or that of the lender, which makes it unless it is there."""

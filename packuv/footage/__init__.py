@@ -1,10 +1,22 @@
 """Pictures of a capture: decoded on demand, undistorted, and what each camera makes of light."""
 
 from packuv.footage.lens import LensCamera
+from packuv.footage.light import Light, LightOptions, measure_light
 from packuv.footage.reader import FrameReader
 from packuv.footage.response import Response
 from packuv.footage.suspect import looks_like_log
 from packuv.footage.transfer import Transfer
 from packuv.footage.views import Views, as_planes
 
-__all__ = ["FrameReader", "LensCamera", "Response", "Transfer", "Views", "as_planes", "looks_like_log"]
+__all__ = [
+    "FrameReader",
+    "LensCamera",
+    "Light",
+    "LightOptions",
+    "Response",
+    "Transfer",
+    "Views",
+    "as_planes",
+    "looks_like_log",
+    "measure_light",
+]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from calibration.accept import RigReport
 from calibration.rig import Rig
@@ -67,6 +68,36 @@ class MotionCurve:
         count = len(self.magnitude_px)
         if any(not 0 <= keyframe < count for keyframe in self.keyframes):
             raise ValueError(f"keyframes must be instants 0 to {count - 1}, but are {self.keyframes}")
+
+
+@dataclass(frozen=True)
+class LightCurve:
+    """How light and the cameras' own exposures change over time: natural logarithms of factors on linear light."""
+
+    light: np.ndarray
+    """float [T, 3]: of each instant, r g b; all 0 where it is steady"""
+    exposures: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """By camera float [T, 3], of those that have an exposure of their own"""
+    reason: str = ""
+    """Why the light is taken for steady"""
+
+    def __post_init__(self) -> None:
+        for name, own in {"light": self.light, **self.exposures}.items():
+            if own.shape != (len(self.light), 3):
+                raise ValueError(f"{name} must be {(len(self.light), 3)} as the light is, but is {own.shape}")
+
+    def jump(self, camera: str) -> tuple[float, int]:
+        """The largest change of a camera's exposure from four instants to the next four, as a factor, and where.
+
+        Flicker, which comes back at once, is next to none.
+        """
+        level, length = self.exposures[camera].mean(axis=1), min(4, len(self.light) // 2)
+        if not length:
+            return 1.0, 0
+        means = sliding_window_view(level, length).mean(axis=1)
+        steps = means[length:] - means[:-length]
+        worst = int(np.abs(steps).argmax())
+        return float(np.exp(steps[worst])), worst + length
 
 
 @dataclass(frozen=True)
@@ -177,6 +208,7 @@ class ReportInput:
     """Cameras that were not balanced although others were, and why"""
     log_like: tuple[str, ...] = ()
     """Cameras whose pictures look like log footage that nobody called so"""
+    light: LightCurve | None = None
     motion: MotionCurve | None = None
     scores: tuple[FrameScore, ...] = ()
     """Of held-out cameras; of fitted ones where none was held out"""

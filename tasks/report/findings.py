@@ -27,6 +27,8 @@ class Limits:
     corner: tuple[float, float] = (0.5, 1.1)
     """Light in the corner as a share of that in the middle, least and most: beyond it hardly a lens, rather points that
     say too little, or light that the scene itself lacks there"""
+    exposure_jump: float = 1.1
+    """A camera's exposure that changes by more than this factor, or its inverse, at once: its automatic may be on"""
     camera_drop_db: float = 6.0
     """A camera this far below the median camera is calibrated, synchronized or balanced worse than the others"""
     frame_drop_db: float = 3.0
@@ -61,6 +63,7 @@ def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...
         *_run_findings(report),
         *_sync_findings(report, limits),
         *_rig_findings(report, limits),
+        *_light_findings(report, limits),
         *_score_findings(report, limits),
         *_scene_findings(report, limits),
     )
@@ -122,6 +125,14 @@ def _colour_findings(report: ReportInput) -> Iterator[Finding]:
         yield Finding(
             "colour", f'{names} {verb} like log footage; say which in capture.toml, such as transfer = "slog3".'
         )
+
+
+def _light_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
+    for camera in report.light.exposures if report.light else ():
+        factor, instant = report.light.jump(camera) if report.light else (1.0, 0)
+        if not 1 / limits.exposure_jump <= factor <= limits.exposure_jump:
+            text = f"The exposure of {camera} jumps by a factor of {factor:.2f} at frame {instant}"
+            yield Finding("light", f"{text}; fit and scores allow for it.")
 
 
 def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:

@@ -34,6 +34,12 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
         "sync": report.sync and report.sync.to_json(),
         "cameras": _cameras_json(report),
         "check": report.check and report.check.to_json(),
+        "light": report.light
+        and {
+            "factors": np.exp(report.light.light).round(5).tolist(),
+            "exposures": {name: np.exp(own).round(5).tolist() for name, own in report.light.exposures.items()},
+            "reason": report.light.reason,
+        },
         "motion": report.motion
         and {
             "magnitude_px": [float(v) if math.isfinite(v) else None for v in report.motion.magnitude_px],

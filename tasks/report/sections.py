@@ -37,6 +37,7 @@ SECTIONS = {
     "sync": "Synchronization",
     "rig": "Camera layout",
     "colour": "Colour balance",
+    "light": "Light over time",
     "motion": "Motion and keyframes",
     "quality": "Quality over time",
     "pictures": "Truth, render, difference",
@@ -71,6 +72,7 @@ def sections(report: ReportInput, found: Sequence[Finding], limits: Limits) -> l
         "sync": _sync(report, limits),
         "rig": _rig(report),
         "colour": _colour(report, limits),
+        "light": _light(report),
         "motion": _motion(report),
         "quality": _quality(report, limits),
         "pictures": _pictures(report),
@@ -171,6 +173,32 @@ def _colour(report: ReportInput, limits: Limits) -> Body:
 def _corner_row(camera: Camera, light: float, limits: Limits) -> View:
     k1, k2 = camera.shading
     return {"camera": camera.name, "light": light, "k1": k1, "k2": k2, "odd": limits.odd_corner(light)}
+
+
+def _light(report: ReportInput) -> Body:
+    curve = report.light
+    if curve is None:
+        return "No light was measured: the stage did not run, or light.enabled is false."
+    if not curve.light.any() and not curve.exposures:
+        return f"Light and exposures are steady: {curve.reason}."
+    frames = range(len(curve.light))
+    lines = [
+        Series(name, frames, (100 * np.expm1(curve.light[:, channel])).tolist(), name)
+        for channel, name in enumerate(("red", "green", "blue"))
+    ]
+    own = [
+        Series(name, frames, (100 * np.expm1(values.mean(axis=1))).tolist(), f"s{number % 6 + 1}")
+        for number, (name, values) in enumerate(curve.exposures.items())
+    ]
+    return {
+        "reason": curve.reason,
+        "light": None if curve.reason else _change_chart(lines, "Light over time"),
+        "exposures": _change_chart(own, "Exposures over time") if own else None,
+    }
+
+
+def _change_chart(lines: Sequence[Series], title: str) -> Markup:
+    return line_chart(lines, title=title, x_label="frame", y_label="change, %")
 
 
 def _motion(report: ReportInput) -> Body:

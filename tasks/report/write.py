@@ -10,6 +10,7 @@ from tasks.artefacts.recipe import naming, write_json
 from tasks.report.facts import (
     Comparison,
     FrameScore,
+    LightCurve,
     MotionCurve,
     ReportInput,
     SceneFigures,
@@ -26,6 +27,7 @@ __all__ = [
     "Comparison",
     "Finding",
     "FrameScore",
+    "LightCurve",
     "Limits",
     "MotionCurve",
     "ReportFiles",

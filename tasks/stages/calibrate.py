@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -221,7 +221,8 @@ class FindPoints(Stage):
     """Triangulate points and balance the colours: points.npz, rig.json with gains and shading, colour.json.
 
     Points, their colours, and the fitted cameras' gains and shading come from the pictures of fitted cameras alone; the
-    others are brought to these points afterwards.
+    others are brought to these points afterwards. Colours are those of steady light and exposure, so that gains hold at
+    every instant.
     """
 
     name, version = "points", 3
@@ -252,9 +253,19 @@ class FindPoints(Stage):
             rig.save(work.out / RIG)
             return {"points": 0, "balanced": False, "reason": str(problem), "log_like": watch.suspects}
         work.progress(0, 1, "balancing colours")
+        light = footage.load_light()
+        factors = None if light is None else light.of(rig.names, count)
+        factors = None if factors is None else factors[chosen]
+        points = _steady(points, rig.names, factors)
         report = balance(rig.select(self.fitted), points, options=options.balance)
         report = balance_held_out(
-            rig, points, report, kept.load(), patch_px=options.triangulate.patch_px, options=options.balance
+            rig,
+            points,
+            report,
+            kept.load(),
+            light=factors,
+            patch_px=options.triangulate.patch_px,
+            options=options.balance,
         )
         points.save(work.out / POINTS)
         with_colours(rig, report).save(work.out / RIG)
@@ -318,6 +329,16 @@ def complete_instants(groups: FrameGroups, cameras: tuple[str, ...], first: int)
             "film little under ignore in capture.toml, or give a calibration"
         )
     return found
+
+
+def _steady(points: SparsePoints, names: Sequence[str], factors: np.ndarray | None) -> SparsePoints:
+    """Points with the colours that they have in steady light and exposure; `factors`, float [instants, cameras of
+    these names, 3], is the natural logarithm of what both make of light."""
+    if factors is None:
+        return points
+    columns = np.array([names.index(name) for name in points.cameras])
+    changes = factors[points.instant[points.point], columns[points.camera]]  # [M, 3]
+    return replace(points, colour=(points.colour / np.exp(changes)).astype(points.colour.dtype))
 
 
 def _lent(root: Path, rig: Files) -> Path:

@@ -11,7 +11,9 @@ import numpy as np
 
 from packuv.files import save_json
 from packuv.fit.keyframe import KeyState
+from packuv.footage import Light
 from packuv.footage.lens import undistorted_camera
+from packuv.footage.light import packed
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.segment import Segment
 from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
@@ -60,7 +62,8 @@ class Encode(Stage):
         return write_scene(path, segments, header.first(frames), options=self.options).frames
 
     def _header(self, site: Site) -> SceneHeader:
-        return scene_header(Footage(self.take, site), self.held_out, KeyState.load(site.path(self.key)))
+        footage = Footage(self.take, site)
+        return scene_header(footage, self.held_out, KeyState.load(site.path(self.key)), footage.load_light())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,13 +98,10 @@ class Verify(Stage):
         return notes
 
 
-def scene_header(
-    footage: Footage, held_out: tuple[str, ...], key: KeyState, light: np.ndarray | None = None
-) -> SceneHeader:
+def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState, light: Light | None = None) -> SceneHeader:
     """What the scene says about its capture. No path and no clock time goes in: same input, same bytes.
 
-    `light`, float [T, 3], is the natural logarithm of light of each instant, without any camera's own exposure; None:
-    it is steady.
+    `light` is that of the footage's instants, with the cameras' own exposures; None: all is steady.
     """
     groups = footage.site.path(footage.take.groups)
     rig, report, transfer = footage.load_rig(), SyncReport.load(groups), footage.take.pictures.transfer
@@ -127,8 +127,9 @@ def scene_header(
             "lenses": [lens_camera(camera).to_json() for camera in rig.cameras],
             # Absent where tags decide, so that scenes of such captures keep their bytes.
             **({"transfer": str(transfer)} if transfer else {}),
+            **({"exposure": {name: packed(own) for name, own in light.exposures.items()}} if light else {}),
         },
-        **({} if light is None else {"light": light}),
+        **({"light": light.light} if light else {}),
     )
 
 

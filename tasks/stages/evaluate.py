@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from packuv.bounds import MOST_CAMERAS, MOST_NS, MOST_SIDE_PX, field, items, whole
+from packuv.bounds import MOST_CAMERAS, MOST_NS, MOST_SIDE_PX, field, fields, items, whole
 from packuv.files import save_json
-from packuv.footage import LensCamera, Transfer, Views
+from packuv.footage import LensCamera, Light, Transfer, Views
+from packuv.footage.light import unpacked
 from packuv.lpips import Lpips, lacking
 from packuv.progress import Progress
-from packuv.scene import open_scene
+from packuv.scene import SceneHeader, open_scene
 from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
 from sync.align import AlignOptions, FrameGroups, align
 from sync.capture import find_capture, load_timecodes
@@ -113,6 +114,7 @@ def evaluate_scene(
             [lenses[name] for name in names],
             max_width=_max_width(header.extra),
             transfer=Transfer(said) if said else None,
+            light=_light(header).of(names, len(frames)),
         )
         scores = score(opened, views, progress, lpips=Lpips(weights) if weights else None)
         return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
@@ -122,6 +124,14 @@ def _lenses(extra: Mapping[str, Any]) -> dict[str, LensCamera]:
     """The scene's cameras as they film, by name."""
     listed = items(field(extra, "lenses", "the scene's header: extra"), "extra: lenses", most=MOST_CAMERAS)
     return {lens.pinhole.name: lens for lens in map(LensCamera.from_json, listed)}
+
+
+def _light(header: SceneHeader) -> Light:
+    """Light of the scene's frames, and the exposures of its cameras."""
+    said = fields(header.extra.get("exposure", {}), "extra: exposure")
+    count = len(header.times_ns)
+    exposures = {name: unpacked(text, count, f"extra: exposure: {name}") for name, text in said.items()}
+    return Light(header.light.astype(np.float32), exposures)
 
 
 def _max_width(extra: Mapping[str, Any]) -> int | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.rig import Camera, Rig
 from packuv.camera import PinholeCamera
-from packuv.footage import FrameReader, LensCamera, Transfer, Views, looks_like_log
+from packuv.footage import FrameReader, LensCamera, Light, Transfer, Views, looks_like_log
 from sync.align import FrameGroups
 from sync.capture import find_capture
 from tasks.artefacts.stage import Site
@@ -19,6 +19,8 @@ from tasks.stages.synchronize import read_videos, selected
 
 RIG = "rig.json"
 """Name of the rig's file in artefacts"""
+LIGHT = "light.npz"
+"""Name of the file of light and exposures over time in artefacts"""
 HDR_TAGS = ("arib-std-b67", "smpte2084")
 """Tags of videos that say what their code values mean, HLG and PQ"""
 
@@ -49,6 +51,8 @@ class Take:
     groups: Key
     rig: Key | None = None
     """Artefact with rig.json; None for who looks at pictures as filmed"""
+    light: Key | None = None
+    """Artefact with light.npz, measured from the instant `first` on; None: light and exposures are steady"""
     cameras: tuple[str, ...]
     """In this order"""
     first: int = 0
@@ -87,11 +91,23 @@ class Footage:
         videos = find_capture(self.site.capture).videos
         lenses = [lens_camera(rig[name]) for name in names]
         frames = np.ascontiguousarray(groups.frames[:, columns])
-        pictures = self.take.pictures
-        return Views(videos, frames, lenses, max_width=pictures.max_width, transfer=pictures.transfer)
+        pictures, light = self.take.pictures, self.load_light()
+        return Views(
+            videos,
+            frames,
+            lenses,
+            max_width=pictures.max_width,
+            transfer=pictures.transfer,
+            light=light.of(names, len(frames)) if light else None,
+        )
+
+    def load_light(self) -> Light | None:
+        """Light of the instants and exposures of the cameras; None where they are steady."""
+        return Light.load(self.site.path(self.take.light) / LIGHT) if self.take.light else None
 
     def open_plate(self, videos: Mapping[str, Path], count: int) -> Views:
-        """Up to `count` frames, spread over each video of the empty stage, as this take's cameras would show them.
+        """Up to `count` frames, spread over each video of the empty stage, as this take's cameras would show them
+        in steady light: a plate has a clock of its own.
 
         Raises ValueError for a video of another size than the take's.
         """
@@ -113,11 +129,18 @@ class Footage:
 
     def filmed(self, instant: int) -> dict[str, np.ndarray]:
         """Pictures as filmed, uint8 [H, W, 3] RGB, of the cameras that have one at this instant of the take."""
-        groups, videos = self.load_groups(), find_capture(self.site.capture).videos
-        names = self.take.cameras
-        reader = FrameReader({name: videos[name] for name in names}, transfer=self.take.pictures.transfer)
-        numbers = {name: int(groups.frames[instant, groups.cameras.index(name)]) for name in names}
-        return {name: reader.read(name, number) for name, number in numbers.items() if number >= 0}
+        reader, frames = self.open_reader(), self.load_frames()
+        return {name: reader.read(name, numbers[instant]) for name, numbers in frames.items() if numbers[instant] >= 0}
+
+    def open_reader(self) -> FrameReader:
+        """Pictures as filmed, by camera and number of the frame."""
+        videos = find_capture(self.site.capture).videos
+        return FrameReader({name: videos[name] for name in self.take.cameras}, transfer=self.take.pictures.transfer)
+
+    def load_frames(self) -> dict[str, np.ndarray]:
+        """By camera the number of its frame at each instant of the take, int [T], -1 where it has none."""
+        groups = self.load_groups()
+        return {name: groups.frames[:, groups.cameras.index(name)] for name in self.take.cameras}
 
     def watch_for_log(self) -> LogWatch:
         """Watches cameras that may have filmed log without saying so: more than 8 bits, no word on what they mean."""

@@ -199,7 +199,18 @@ def test_an_earlier_stop_and_another_seed(first, capture):
     stopped, _ = run(request(capture, out, stop_after="flow", seed=1))
     assert made(stopped) == set()  # nothing before the fit reads the seed
     assert stopped.scene is None
-    assert set(artefacts(stopped)) == {"sync", "rig", "points", "motion", "keyframes"}
+    assert set(artefacts(stopped)) == {"sync", "rig", "light", "points", "motion", "keyframes"}
+
+
+def test_light_may_be_left_out_and_changes_nothing_where_it_is_steady(first, capture, tmp_path):
+    outcome, _ = first
+    skipped = {event.label: event.reason for event in outcome.events if event.outcome == "skipped"}
+    assert "less than 0.20%" in skipped["light of the instant"]
+    without, _ = run(request(capture, tmp_path, settings={**SETTINGS, "light": {"enabled": False}}, stop_after="flow"))
+    assert {event.label: event.reason for event in without.events}["light"] == "light.enabled is false"
+    assert set(artefacts(without)) == {"sync", "rig", "points", "motion", "keyframes"}
+    keys = artefacts(outcome)
+    assert all(keys[stage] == key for stage, key in artefacts(without).items())
 
 
 def test_flow_shows_what_was_skipped(workflow, first, capture):
@@ -273,7 +284,7 @@ def test_a_video_that_is_another_one_for_a_while_leaves_nothing_wrong_behind(fir
         assert seen[-1] == "FindBackground"
         shutil.copyfile(capture / "videos/cam01.mp4", video)
         whole = process(asked, Journal(), Engine(stage_after("", video)), jobs_of(asked))
-    assert made(whole).isdisjoint({"sync", "rig", "points", "motion", "keyframes"})
+    assert made(whole).isdisjoint({"sync", "rig", "light", "points", "motion", "keyframes"})
     assert sha256(whole.scene) == sha256(outcome.scene)
 
 

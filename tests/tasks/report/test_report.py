@@ -29,6 +29,7 @@ from tasks.report.record import summary
 from tasks.report.write import (
     Comparison,
     FrameScore,
+    LightCurve,
     MotionCurve,
     ReportInput,
     SceneFigures,
@@ -83,6 +84,12 @@ def make_scene() -> SceneFigures:
     return SceneFigures("scene.mkv", sum(sizes) + 12_345, Fraction(30), sizes, (5000,) * 12, (800,) * 12, True)
 
 
+def make_light(factor: float = 1.05) -> LightCurve:
+    """Light that falls by 4 %, and a camera whose exposure rises by a factor at frame 5."""
+    level = np.where(np.arange(FRAMES) < 5, 0, np.log(factor))[:, None] * np.ones(3)
+    return LightCurve(np.linspace(0.02, -0.02, FRAMES)[:, None] * np.ones(3), {"cam2": level - level.mean(axis=0)})
+
+
 def make_report() -> ReportInput:
     rng = np.random.default_rng(2)
     truth = rng.integers(0, 256, (90, 160, 3), dtype=np.uint8)
@@ -99,6 +106,7 @@ def make_report() -> ReportInput:
         rig=rig,
         held_out=HELD_OUT,
         check=check_rig(rig),
+        light=make_light(),
         motion=MotionCurve(np.linspace(0, 2, FRAMES), (0, 7)),
         scores=make_scores(),
         scene=make_scene(),
@@ -168,9 +176,11 @@ def test_the_page_has_every_section_and_stands_alone() -> None:
         assert 'class="none"' not in section(text, name), name
 
 
-@pytest.mark.parametrize("missing", ["sync", "rig", "check", "motion", "scores", "scene", "pictures", "stages", "all"])
+@pytest.mark.parametrize(
+    "missing", ["sync", "rig", "check", "light", "motion", "scores", "scene", "pictures", "stages", "all"]
+)
 def test_a_missing_part_says_so_and_spoils_nothing(missing: str, tmp_path: Path) -> None:
-    nothing = {name: None for name in ("sync", "rig", "check", "motion", "scene")}
+    nothing = {name: None for name in ("sync", "rig", "check", "light", "motion", "scene")}
     nothing |= {name: () for name in ("scores", "pictures", "stages")}
     report = make_report()
     report = ReportInput("empty") if missing == "all" else replace(report, **{missing: nothing[missing]})
@@ -182,6 +192,7 @@ def test_a_missing_part_says_so_and_spoils_nothing(missing: str, tmp_path: Path)
         "sync": {"sync"},
         "rig": {"rig", "colour"},
         "check": set(),
+        "light": {"light"},
         "motion": {"motion"},
         "scores": {"quality"},
         "scene": {"size", "gaussians"},
@@ -218,6 +229,7 @@ def test_names_and_reasons_stay_text_wherever_they_come_up() -> None:
         sync=replace(sync, reference=bad, cameras=rows),
         rig=Rig(cameras, bad),
         held_out=(bad,),
+        light=replace(make_light(), exposures={bad: make_light(2.0).exposures["cam2"]}, reason=bad),
         scores=tuple(replace(score, camera=bad) for score in report.scores[:FRAMES]),
         scene=replace(make_scene(), name=bad, verified=False, problem=bad),
         pictures=tuple(replace(item, camera=bad, choice=bad) for item in report.pictures),
@@ -229,7 +241,7 @@ def test_names_and_reasons_stay_text_wherever_they_come_up() -> None:
     assert text.count("<script") == page_text(report).count("<script") == 1
     assert "&amp;lt;" not in text  # escaped once
     words = Page(text).words
-    for name in ("sync", "rig", "colour", "quality", "pictures", "size", "stages", "skipped", "run"):
+    for name in ("sync", "rig", "colour", "light", "quality", "pictures", "size", "stages", "skipped", "run"):
         assert bad.replace(" ", "") in Page(section(text, name)).words.replace(" ", ""), name
     assert words.count(bad) > 20
 
@@ -253,6 +265,8 @@ def test_json_holds_the_numbers(tmp_path: Path) -> None:
     assert [FrameScore(**score) for score in data["scores"]] == list(report.scores)
     assert data["cameras"][4]["held_out"] is True
     assert np.allclose(data["cameras"][0]["centre"], make_rig().cameras[0].centre)
+    assert np.allclose(np.log(data["light"]["factors"]), make_light().light, atol=1e-5)
+    assert data["light"]["exposures"].keys() == {"cam2"}
     assert data["motion"] == {"magnitude_px": np.linspace(0, 2, FRAMES).tolist(), "keyframes": [0, 7]}
     assert data["scene"]["frame_bytes"] == list(make_scene().frame_bytes)
     assert data["summary"]["verified"] is True
@@ -347,6 +361,24 @@ def test_scores_without_areas_show_none() -> None:
     report = make_report()
     assert "Where the error lies" not in Page(page_text(report)).words
     assert summary(report)["psnr_moving_db"] is None
+
+
+def test_a_camera_whose_exposure_jumps_is_named() -> None:
+    assert make_light(1.25).jump("cam2") == (pytest.approx(1.25), 5)
+    assert texts(replace(make_report(), light=make_light(0.8))) == [
+        "light: The exposure of cam2 jumps by a factor of 0.80 at frame 5; fit and scores allow for it."
+    ]
+    flicker = {"cam2": 0.2 * (-1.0) ** np.arange(FRAMES)[:, None] * np.ones(3)}
+    assert texts(replace(make_report(), light=replace(make_light(), exposures=flicker))) == []
+    steady = LightCurve(np.zeros((1, 3)), {"cam2": np.zeros((1, 3))})
+    assert steady.jump("cam2") == (1.0, 0)
+
+
+def test_steady_light_says_why() -> None:
+    steady = LightCurve(np.zeros((FRAMES, 3)), reason="it changes by 0.05 %, less than 0.20 %")
+    assert "0.05 %, less than" in section(page_text(replace(make_report(), light=steady)), "light")
+    own = replace(steady, exposures=make_light().exposures)
+    assert "Light of the room is taken for steady" in section(page_text(replace(make_report(), light=own)), "light")
 
 
 def test_cameras_that_code_colour_otherwise_and_log_footage_are_named() -> None:

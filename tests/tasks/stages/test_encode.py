@@ -10,6 +10,7 @@ import pytest
 
 from packuv.fit.keyframe import KeyState
 from packuv.fit.start.bounds import Bounds
+from packuv.footage import Light
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
@@ -109,7 +110,7 @@ def test_the_scene_says_how_it_was_filmed(site, take, key, fitted, tmp_path):
 def test_the_header_takes_light_of_the_instants(site, take, key):
     footage, state = Footage(take, site), KeyState.load(site.path(key))
     light = np.linspace(-0.2, 0.2, 18).reshape(6, 3).round(5)
-    assert np.array_equal(scene_header(footage, (), state, light).light, light)
+    assert np.array_equal(scene_header(footage, (), state, Light(light.astype(np.float32))).light, light)
     assert not scene_header(footage, (), state).light.any()
 
 

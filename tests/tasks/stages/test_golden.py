@@ -12,11 +12,11 @@ import llvmlite.binding
 import pytest
 
 from tasks.artefacts.stage import Stage
-from tasks.stages import calibrate, encode, evaluate, fitting, preview, synchronize, track
+from tasks.stages import calibrate, encode, evaluate, fitting, light, preview, synchronize, track
 from tests.support import golden
 from tests.support.needs import needs
 
-MODULES = (synchronize, calibrate, track, fitting, preview, encode, evaluate)
+MODULES = (synchronize, calibrate, light, track, fitting, preview, encode, evaluate)
 
 
 @pytest.mark.slow
