@@ -149,10 +149,10 @@ class Sequence:
     def _fit(self) -> None:
         take, options = self._take("points"), self.options
         background = None
-        if options.fit.background.iteration_share:
+        if options.fit.background.instants:
             background = self._make(background_of(self.workshop, take, options.fit.background))
         else:
-            self.workshop.listener.skipped("background", "fit.background.iteration_share is 0")
+            self.workshop.listener.skipped("background", "fit.background.instants is 0")
         told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
         chain = Chain(self.workshop, self.plan, options, self.submit, told, background, self.made.only("motion"))
         previews = []

@@ -86,7 +86,6 @@ class FirstOptions(KeyframeOptions):
     """Near plane, in scene radii; cameras may sit in the wall they film"""
     backdrop_share: float = 0.75
     """Of the cap on Gaussians, at most, for what stands still"""
-    background: BackgroundOptions = field(default_factory=BackgroundOptions)
     shell: ShellOptions = field(default_factory=ShellOptions)
 
     def __post_init__(self) -> None:
@@ -139,6 +138,8 @@ class FrameOptions(ChangeOptions):
 @dataclass(frozen=True)
 class FitOptions(FirstOptions, NextOptions, FrameOptions):
     """All settings of a fit; presets live in `pipelines.options`."""
+
+    background: BackgroundOptions = field(default_factory=BackgroundOptions)
 
     def __post_init__(self) -> None:
         for part in (FirstOptions, NextOptions, FrameOptions):

@@ -20,19 +20,18 @@ from packuv.progress import Progress, no_progress
 @dataclass(frozen=True)
 class BackgroundOptions:
     instants: int = 15
-    """Evenly over the sequence, of which the median is taken; fewer than three leave no background"""
-    iteration_share: float = 0.4
-    """Share of the first keyframe's iterations that fit the background; 0 fits none"""
+    """Evenly over the sequence, of which the median is taken; fewer than three leave no background, and 0 none of an
+    empty stage either"""
     tolerance: int = 12
     """Grey values of 255 from the median that noise and shadows explain"""
     agreement: float = 0.6
     """Share of the instants that must lie within the tolerance, or the place is unknown: somebody stood there"""
 
     def __post_init__(self) -> None:
-        if self.instants < 0 or self.tolerance < 0 or not (0 <= self.iteration_share < 1 and 0 < self.agreement <= 1):
+        if self.instants < 0 or self.tolerance < 0 or not 0 < self.agreement <= 1:
             raise ValueError(
-                "instants and tolerance must not be negative, iteration_share must lie in [0, 1) and agreement in "
-                f"(0, 1], but they are {self.instants}, {self.tolerance}, {self.iteration_share} and {self.agreement}"
+                "instants and tolerance must not be negative and agreement must lie in (0, 1], "
+                f"but they are {self.instants}, {self.tolerance} and {self.agreement}"
             )
 
 

@@ -255,8 +255,7 @@ class MeasureSeam(Stage):
 
 
 def background_of(workshop: Workshop, take: Take, options: BackgroundOptions) -> FindBackground | UsePlate:
-    """The stage for a take; how much of a fit the background gets changes nothing of what it is."""
-    options = replace(options, iteration_share=BackgroundOptions().iteration_share)
+    """The stage for a take."""
     videos = {name: video for name, video in find_plate(workshop.capture).items() if name in take.cameras}
     if not videos:
         return FindBackground(take=take, options=options)

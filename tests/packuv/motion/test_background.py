@@ -54,8 +54,8 @@ def test_cameras_that_filmed_too_little_have_no_background(views):
 
 
 def test_options_refuse_shares_that_leave_nothing():
-    with pytest.raises(ValueError, match="iteration_share"):
-        BackgroundOptions(iteration_share=1.0)
+    with pytest.raises(ValueError, match="agreement"):
+        BackgroundOptions(agreement=1.5)
 
 
 def test_saved_backgrounds_come_back(views, tmp_path):

@@ -14,7 +14,7 @@ from tests.support.places import ROOT
 
 CHAIN, FITTING = "pipelines/chain.py", "tasks/stages/fitting.py"
 FAULTS = [
-    (CHAIN, "FitFirst(take=self.take, background=", "FitFirst(take=self.take, backgruond=", "backgruond"),
+    (CHAIN, "FitFirst(take=self.take, instant=", "FitFirst(take=self.take, instnat=", "instnat"),
     (
         FITTING,
         "    def build(self, work: Work) -> Notes:\n        segment, figures",
