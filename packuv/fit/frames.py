@@ -79,7 +79,7 @@ def _fit_frame(
     model.forget_moments(np.flatnonzero(rows | spare))
     solver.free(rows | spare)
     shots = tiled(find_shots(views, instant, masks), masks, solver, views)
-    losses, count = solver.settle(shots, options)
+    losses, count = solver.settle(shots, options, usual=key.usual_loss)
     changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
     figures = {
         "instant": instant,

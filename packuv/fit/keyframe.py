@@ -13,6 +13,7 @@ the ones that were fitted.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -66,6 +67,11 @@ class KeyState:
     def foreground(self) -> Gaussians:
         """Rows after those of the backdrop"""
         return rows_of(self.gaussians, slice(self.backdrop, None))
+
+    @property
+    def usual_loss(self) -> float:
+        """What frames of the segment may be expected to reach; infinite where the fit saw more than what changes."""
+        return self.figures["loss"] if self.backdrop and self.figures.get("loss") else math.inf
 
     def open_backdrop(self, device: str) -> Backdrop:
         """The backdrop, to draw over."""

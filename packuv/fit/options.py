@@ -127,7 +127,9 @@ class FrameOptions(ChangeOptions):
     births_share: float = 0.05
     """Of the moving rows, how many empty ones may come alive in one pass"""
     settle: float = 0.02
-    """A frame stops when its last two rounds lowered the loss by less than this share, on average"""
+    """A frame stops when its last two rounds lowered the loss by less than this share, on average, ..."""
+    near_key: float = 1.3
+    """... and when its loss is at most this many times its keyframe's: slow gains far from there are a hard frame"""
     lift: LiftOptions = field(default_factory=LiftOptions)
 
     def __post_init__(self) -> None:

@@ -139,15 +139,17 @@ class Solver:
                 ticks.advance()
         return mean_losses(losses[-len(shots) :])
 
-    def settle(self, shots: Sequence[Shot], options: FrameOptions) -> tuple[Losses | None, int]:
-        """Rounds over the cameras until they gain little; returns the mean losses and the iterations that it took.
+    def settle(self, shots: Sequence[Shot], options: FrameOptions, *, usual: float) -> tuple[Losses | None, int]:
+        """Rounds over the cameras until they gain little and the loss is near the `usual` one; returns the mean losses
+        and the iterations that it took.
 
         A gain compares each picture with itself, in iterations that draw everything; the losses are None if none did.
         Empty rows are used for what the pictures lack after each of the first rounds.
         """
         limit, done = options.frame_iterations, 0
         losses, gains = dict[int, Losses](), list[float]()
-        while done < limit and not (gains and np.mean(gains[-2:]) < options.settle):
+        near = options.near_key * usual
+        while done < limit and not (gains and np.mean(gains[-2:]) < options.settle and _total(losses) <= near):
             count = min(max(len(shots), _ROUND), limit - done)
             fresh, done = self._round(shots, count, options.frame_rate_scale), done + count
             if both := sorted(losses.keys() & fresh.keys()):
@@ -284,6 +286,11 @@ class Solver:
         self.gradient = ScreenGradient(len(self.model))
         self._drawn = None
         self._guard.renew(self.model)
+
+
+def _total(losses: Mapping[int, Losses]) -> float:
+    """Mean over the shots of the sum of the terms."""
+    return float(np.mean([sum(terms.values()) for terms in losses.values()]))
 
 
 def tiled(shots: Sequence[Shot], masks: Sequence[np.ndarray | None], solver: Solver, views: Views) -> list[Shot]:

@@ -28,11 +28,11 @@ def shots(shift: float) -> list[Shot]:
     return [Shot(view, render(truth, view, options=OPTIONS).colour.clip(0, 1)) for view in VIEWS]
 
 
-def settled(shots: list[Shot], limit: int, **changes: Any) -> tuple[Solver, float | None, int]:
+def settled(shots: list[Shot], limit: int, usual: float = np.inf, **changes: Any) -> tuple[Solver, float | None, int]:
     """A solver that has settled on the shots, its loss, and the iterations that it took."""
     options = FitOptions(random_background=False, frame_iterations=limit, **changes)
     tried = solver(**changes)
-    losses, count = tried.settle(shots, options)
+    losses, count = tried.settle(shots, options, usual=usual)
     return tried, None if losses is None else sum(losses.values()), count
 
 
@@ -63,6 +63,14 @@ def test_slower_gains_are_waited_for_if_asked():
     short = settled(shots(0.15), LIMIT, near_jitter=0.0, settle=0.2)[2]
     long = settled(shots(0.15), LIMIT, near_jitter=0.0, settle=0.005)[2]
     assert short < long
+
+
+def test_a_frame_far_from_its_keyframes_loss_goes_on_although_it_gains_little():
+    early = settled(shots(0.15), LIMIT, near_jitter=0.0, settle=0.2)
+    _, loss, count = settled(shots(0.15), LIMIT, early[1] / 2 / 1.3, near_jitter=0.0, settle=0.2, near_key=1.3)
+    assert early[2] < count < LIMIT
+    assert loss <= early[1] / 2
+    assert settled(shots(0.15), LIMIT, 1e-9, near_jitter=0.0, settle=0.2)[2] == LIMIT
 
 
 def test_the_limit_holds_and_no_loss_is_made_up():
