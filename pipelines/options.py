@@ -43,12 +43,12 @@ _PRESETS: Mapping[str, Mapping[str, Any]] = {
     "standard": {
         "pictures": {"max_width": 1280},
         "fit": {
-            "iterations": 5000,
-            "key_iterations": 1500,
+            "iterations": 3000,
+            "key_iterations": 800,
             "frame_iterations": 480,
-            "settle": 0.02,
+            "settle": 0.05,
             "start": {"count": 30_000},
-            "density": {"cap": 80_000},
+            "density": {"cap": 68_000},
         },
     },
     "high": {

@@ -95,6 +95,7 @@ def write() -> None:
 
 
 def _measure_here() -> Found:
+    from packuv.fit.options import FirstOptions
     from packuv.progress import no_progress
     from pipelines.options import compose
     from pipelines.stages import Made, Sequence
@@ -105,7 +106,7 @@ def _measure_here() -> Found:
     from tasks.artefacts.store import Key, Store
     from tasks.artefacts.workshop import Workshop
     from tasks.stages.calibrate import borrow_rig
-    from tasks.stages.fitting import CutSegment, FitNext, background_of
+    from tasks.stages.fitting import CutSegment, FitFirst, FitNext, background_of
     from tasks.stages.footage import Take
     from tasks.stages.plan import Plan
 
@@ -157,10 +158,11 @@ def _measure_here() -> Found:
         take = Take(groups=only("sync"), rig=only("points"), cameras=plan.fitted, stop=3)
         elsewhere = replace(workshop, originals=Originals(find_capture(empty), memory))
         make(background_of(elsewhere, take, options.fit.background), replace(site, capture=empty))
-        segment = sequence.made.keys["segment"][0]
+        key, segment = sequence.made.keys["key"][0], sequence.made.keys["segment"][0]
         make(CutSegment(segment=segment, frames=2))
+        make(FitFirst(take=take, instant=0, options=options.fit.part(FirstOptions)))  # this capture has a backdrop
         following = next(stage for stage in steps if isinstance(stage, FitNext))
-        going_on = replace(following, end=segment, step=(2, 3))
+        going_on = replace(following, previous=key, end=segment, instant=3)
         found["FitNext, from a segment's end"] = {
             "version": going_on.version,
             "inputs": _inputs(going_on, made),
