@@ -46,7 +46,7 @@ _PRESETS: Mapping[str, Mapping[str, Any]] = {
             "iterations": 3000,
             "key_iterations": 800,
             "frame_iterations": 480,
-            "settle": 0.05,
+            "settle": 0.02,
             "start": {"count": 30_000},
             "density": {"cap": 68_000},
         },

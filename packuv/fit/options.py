@@ -121,8 +121,9 @@ class FrameOptions(ChangeOptions):
 
     frame_iterations: int = 240
     """Of each frame inside a segment, at most"""
-    frame_rate_scale: float = 4.0
-    """Factor on the means' rate inside segments: the lifted motion is only nearly right"""
+    frame_rate_scale: float = 2.0
+    """Factor on the means' rate inside segments: the lifted motion is only nearly right. Over 19 frames of "basketball"
+    moving areas of unseen cameras have 26.5 dB with 4, 26.8 with 2"""
     spare: int = 1500
     """Rows per segment that are empty at its keyframe, for what comes into view"""
     births_share: float = 0.05
