@@ -15,13 +15,11 @@ from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.fitting import (
     CutSegment,
-    FitBackdrop,
     FitFirst,
     FitNext,
     FitSegment,
     MeasureSeam,
     count_pictures,
-    has_backdrop,
     read_losses,
     read_seam,
 )
@@ -65,6 +63,7 @@ class Chain:
     submit: Submit
     take: Take
     background: Key | None
+    backdrop: Key | None
     motion: Key
 
     def fit(self, spans: Sequence[range]) -> Iterator[tuple[Key, Key]]:
@@ -88,12 +87,11 @@ class Chain:
     def _pieces(self, spans: Sequence[Span]) -> dict[int, Piece]:
         """Those whose keyframe goes on from no segment, by place: the first, and side by side all of them."""
         alone = range(len(spans) if self.plan.side_by_side else 1)
-        pictures = count_pictures(self.workshop, self.plan, self.take.groups, [span.instants.start for span in spans])
-        if not (self.background and has_backdrop(self.workshop, self.background, max(pictures))):
+        if self.backdrop is None:
+            starts = [span.instants.start for span in spans]
+            pictures = count_pictures(self.workshop, self.plan, self.take.groups, starts)
             return dict(self._linked(spans, alone, *fitting_order(pictures)))
-        fit = self.options.fit.part(FirstOptions)
-        backdrop = self.submit(FitBackdrop(take=self.take, background=self.background, options=fit)).result()
-        keys = [self._next(backdrop, spans[index].instants.start) for index in alone]
+        keys = [self._next(self.backdrop, spans[index].instants.start) for index in alone]
         return {index: self._piece(key.result(), spans[index]) for index, key in zip(alone, keys, strict=True)}
 
     def _linked(

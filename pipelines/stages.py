@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from packuv.fit.options import FirstOptions
 from packuv.lpips import lacking
 from pipelines.chain import Chain, Submit
 from pipelines.options import SequenceOptions
@@ -22,7 +23,7 @@ from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig
 from tasks.stages.encode import Encode, Verify
 from tasks.stages.evaluate import Evaluate, scored_cameras
-from tasks.stages.fitting import background_of
+from tasks.stages.fitting import FitBackdrop, background_of, count_pictures, lacks_backdrop
 from tasks.stages.footage import Take
 from tasks.stages.light import MeasureLight, is_steady
 from tasks.stages.plan import Plan
@@ -147,21 +148,36 @@ class Sequence:
         self._make(ChooseKeyframes(motion=motion, options=self.options.keyframes))
 
     def _fit(self) -> None:
-        take, options = self._take("points"), self.options
-        background = None
-        if options.fit.background.instants:
-            background = self._make(background_of(self.workshop, take, options.fit.background))
-        else:
-            self.workshop.listener.skipped("background", "fit.background.instants is 0")
+        take, options, spans = self._take("points"), self.options, self._spans()
         told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
-        chain = Chain(self.workshop, self.plan, options, self.submit, told, background, self.made.only("motion"))
+        background = self._background(take)
+        backdrop = self._backdrop(told, background, spans)
+        motion = self.made.only("motion")
+        chain = Chain(self.workshop, self.plan, options, self.submit, told, background, backdrop, motion)
         previews = []
-        for number, (key, segment) in enumerate(chain.fit(self._spans()), start=1):
+        for number, (key, segment) in enumerate(chain.fit(spans), start=1):
             self.made.add(key, segment)
             if self.watched:
                 previews.append(self.submit(self._preview(key, segment, number)))
         for preview in previews:
             self.made.add(preview.result())
+
+    def _background(self, take: Take) -> Key | None:
+        options = self.options.fit.background
+        if not options.instants:
+            self.workshop.listener.skipped("background", "fit.background.instants is 0")
+            return None
+        return self._make(background_of(self.workshop, take, options))
+
+    def _backdrop(self, take: Take, background: Key | None, spans: list[range]) -> Key | None:
+        if background is None:
+            return None
+        pictures = count_pictures(self.workshop, self.plan, take.groups, [span.start for span in spans])
+        if reason := lacks_backdrop(self.workshop, background, max(pictures)):
+            self.workshop.listener.skipped("backdrop", reason)
+            return None
+        fit = self.options.fit.part(FirstOptions)
+        return self._make(FitBackdrop(take=take, background=background, options=fit))
 
     def _spans(self) -> list[range]:
         return read_spans(self.workshop.path(self.made.only("keyframes")))

@@ -20,7 +20,7 @@ from typing import Any
 
 from tasks.artefacts.store import GONE, RECEIPT, WORK, Store, find_stores, try_lock
 
-REMAKEABLE = ("motion", "background", "seam", "key", "segment")
+REMAKEABLE = ("motion", "background", "seam", "backdrop", "key", "segment")
 """Stages whose artefacts go for a quota, in this order: the heaviest of which results need the least go first"""
 RUN = "run.json"
 RESULTS = frozenset({"encode", "verify", "evaluate"})

@@ -262,10 +262,16 @@ def background_of(workshop: Workshop, take: Take, options: BackgroundOptions) ->
     return UsePlate(take=take, plate=workshop.files(videos, "reading plate"), options=options)
 
 
-def has_backdrop(workshop: Workshop, background: Key, pictures: int) -> bool:
-    """Whether enough is known to stand still to build all keyframes on, where so many cameras film at once."""
+def lacks_backdrop(workshop: Workshop, background: Key, pictures: int) -> str | None:
+    """Why keyframes cannot build on a backdrop, where so many cameras film at once; None where they can."""
     notes = workshop.store.receipt(background).notes
-    return enough_stands_still(notes["cameras"], notes["known_share"], pictures)
+    cameras, known = notes["cameras"], notes["known_share"]
+    if enough_stands_still(cameras, known, pictures):
+        return None
+    return (
+        f"{cameras} of {pictures} cameras show what stands still, and {known:.0%} of their pictures; each keyframe is "
+        "fitted whole"
+    )
 
 
 def count_pictures(workshop: Workshop, plan: Plan, groups: Key, instants: Sequence[int]) -> list[int]:
