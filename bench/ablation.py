@@ -47,7 +47,8 @@ ROWS: Mapping[str, Sequence[str]] = {
     # The file holds what was fitted to the bit, so only the size differs.
     "w/o codec": (),
     "w/o shell": ("fit.shell.enabled=false",),
-    "w/o background": ("fit.background.instants=0",),
+    "w/o backdrop": ("fit.background.instants=0",),
+    "w/o light": ("light.enabled=false",),
     "w/o random background": ("fit.random_background=false",),
     "w/o lifted motion": ("fit.lift.enabled=false",),
     "w/o depth term": ("fit.depth_weight=0",),

@@ -34,6 +34,7 @@ def gather(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{folder} must hold a run that went on to its scores, but has none; run it again to its end")
     metrics = json.loads((parts["evaluate"][0] / "metrics.json").read_text())
     keys = sorted((json.loads((path / "key.json").read_text()) for path in parts["key"]), key=lambda k: k["instant"])
+    backdrop = [json.loads((path / "key.json").read_text())["figures"] for path in parts.get("backdrop", [])]
     return {
         "request": {name: run["request"][name] for name in ("preset", "settings", "frames", "hold_out", "seed")},
         "packuv": run["packuv"],
@@ -45,6 +46,7 @@ def gather(folder: Path) -> dict[str, Any]:
         **_over_time(parts["evaluate"][0] / "metrics.arrow"),
         "frames": metrics["frames"],
         "bytes": metrics["bytes"],
+        "backdrop": {name: backdrop[0].get(name) for name in _KEY_FIGURES} if backdrop else None,
         "keyframes": {k["instant"]: {name: k["figures"].get(name) for name in _KEY_FIGURES} for k in keys},
         "transition_frames": _transitions(parts["segment"]),
     }
