@@ -20,8 +20,8 @@ import numpy as np
 from numba import njit
 
 from calibration.multiview import medians
-from calibration.rig import Rig
-from calibration.shading import MOST_SHADING, shading_basis, turns_back
+from calibration.rig import MOST_SHADING, Rig
+from calibration.shading import shading_basis, turns_back
 from calibration.triangulate import SparsePoints
 
 

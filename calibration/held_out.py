@@ -24,8 +24,8 @@ from calibration.colour import (
     triple,
     trust,
 )
-from calibration.rig import Camera, Rig
-from calibration.shading import MOST_SHADING, shading_basis, turns_back
+from calibration.rig import MOST_SHADING, Camera, Rig
+from calibration.shading import shading_basis, turns_back
 from calibration.triangulate import SparsePoints, patch_light
 
 MOST_DEVIATION = 0.5

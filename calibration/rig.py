@@ -19,6 +19,10 @@ MOST_SIDE_PX, MOST_PIXELS, MOST_NUMBER = 2**15, 2**28, 1e30
 """Of a picture, and of lengths and lens parameters; packuv.bounds has the same"""
 
 
+MOST_SHADING = 2.0
+"""Of k1 and of k2; packuv.footage.lens has the same"""
+
+
 @dataclass(frozen=True)
 class Camera:
     """One calibrated camera."""
@@ -63,6 +67,10 @@ class Camera:
             raise ValueError(
                 f"camera {self.name!r}: intrinsics, lens, gains, size and place must be finite, up to {MOST_NUMBER:g}, "
                 f"but are {numbers} and {self.camera_from_world[:3, 3].tolist()}"
+            )
+        if len(self.shading) != 2 or max(map(abs, self.shading)) > MOST_SHADING:
+            raise ValueError(
+                f"camera {self.name!r}: shading must be two numbers within {MOST_SHADING}, not {self.shading}"
             )
         if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
             raise ValueError(

@@ -14,8 +14,6 @@ import numpy as np
 
 from calibration.rig import Camera
 
-MOST_SHADING = 2.0
-"""Of k1 and of k2; packuv.footage.lens has the same"""
 MOST_TURN = 0.05
 """ln V may rise again by this much on its way to the corner, or fall; lenses do no more, noise does"""
 

@@ -45,8 +45,8 @@ class Score:
     """Against the picture as filmed, the calibrated render with the one gain per channel that fits this picture best"""
     ssim_own: float
     flicker: float | None
-    """Mean absolute change, since the camera's last frame, of the difference between render and truth in the rig's
-    colour: what blinks in the render but not in the truth, whatever moves. None in a first frame"""
+    """Mean absolute change, since the camera's last frame, of the difference between calibrated render and truth: what
+    blinks in the render but not in the truth, whatever moves. None in a first frame"""
     psnr_moving_db: float | None
     """Of the calibrated render, where the camera's filmed picture moved since its last one. None in a first frame"""
     psnr_still_db: float | None
@@ -146,8 +146,8 @@ class _Watch:
 
     def never_moving(self) -> Iterator[float | None]:
         """PSNR of each picture where nothing ever moved, dB."""
-        still = ~self.moved if self.moved is not None else np.zeros_like(self.blocks[0], dtype=bool)
-        return (_level(block[still]) for block in self.blocks)
+        still = np.zeros(0, bool) if self.moved is None else ~self.moved
+        return (_level(block[still]) if still.size else None for block in self.blocks)
 
 
 def _shrunk(plane: np.ndarray) -> np.ndarray:

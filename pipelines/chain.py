@@ -1,5 +1,5 @@
-"""The fits of a sequence: a chain of keyframes, segments beside it, keyframes that a segment turns out to need, and
-borders between segments that show."""
+"""The fits of a sequence: keyframes, from the backdrop or one from another, segments beside them, keyframes that a
+segment turns out to need, and borders between segments that show."""
 
 from __future__ import annotations
 
@@ -85,7 +85,8 @@ class Chain:
                 yield piece[0], piece[1].result()
 
     def _pieces(self, spans: Sequence[Span]) -> dict[int, Piece]:
-        """Those whose keyframe goes on from no segment, by place: the first, and side by side all of them."""
+        """Those whose keyframe goes on from no segment, by place: the first, side by side all of them, and without a
+        backdrop those up to the one that most cameras filmed."""
         alone = range(len(spans) if self.plan.side_by_side else 1)
         if self.backdrop is None:
             starts = [span.instants.start for span in spans]

@@ -119,7 +119,9 @@ def fit_backdrop(
     room = replace(options.density, cap=round(options.backdrop_share * options.density.cap))
     state = _fit_all(views, shots, None, points, replace(options, density=room), progress)
     drawn = state.quantizer.encode(state.gaussians).attributes[:, OPACITY] > DEAD_CODE
-    return replace(state, gaussians=rows_of(state.gaussians, drawn), backdrop=int(drawn.sum()))
+    count = int(drawn.sum())
+    figures = {**state.figures, "gaussians": count}
+    return replace(state, gaussians=rows_of(state.gaussians, drawn), backdrop=count, figures=figures)
 
 
 def fit_first(
@@ -201,11 +203,19 @@ def fit_next(
     seen = [mask if alone is None else alone for alone, mask in zip(standing, masks, strict=True)]
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
+    if not solver.rows.any():  # nothing that enough cameras see
+        figures = _figures(started, {}, solver)
+        return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
     losses = solver.run(shots, options.key_iterations, of=options.key_iterations, grow_from=len(model),
                       ticks=Ticks(progress, options.key_iterations))  # fmt: skip
     solver.keep(~solver.rows | solver.worth_keeping())
-    gaussians = joined(rows_of(previous.gaussians, slice(0, previous.backdrop)), model.gaussians)
-    return replace(previous, instant=instant, gaussians=gaussians, figures=_figures(started, losses, solver))
+    figures = _figures(started, losses, solver)
+    return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
+
+
+def _whole(previous: KeyState, model: Model) -> Gaussians:
+    """The backdrop and what stands before it."""
+    return joined(rows_of(previous.gaussians, slice(0, previous.backdrop)), model.gaussians)
 
 
 def _changes(views: Views, first: int, last: int, motion: MotionOptions) -> list[np.ndarray | None]:
@@ -275,7 +285,7 @@ def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, o
 
 
 def choose_quantizer(gaussians: Gaussians, bounds: Bounds, sh_degree: int) -> Quantizer:
-    """Ranges from the first keyframe with room for what later frames bring; frozen for the sequence."""
+    """Ranges from what is fitted first with room for what later frames bring; frozen for the sequence."""
     values = attribute_values(gaussians)  # [N, A]
     low, high = (np.quantile(values, q, axis=0).astype(np.float64) for q in (0.0005, 0.9995))
     margin = 0.15 * np.maximum(high - low, 1e-3)
@@ -300,7 +310,7 @@ def _hull_gaussians(
     instant: int,
     masks: Sequence[np.ndarray | None],
     bounds: Bounds,
-    options: KeyframeOptions,
+    options: NextOptions,
     rng: np.random.Generator,
     sh_degree: int,
 ) -> Gaussians:

@@ -49,8 +49,8 @@ class SolverOptions(LossOptions):
     near_reach: float = 0.7
     """In scene radii"""
     random_background: bool = True
-    """Draw keyframes before a colour at random in each iteration, but where a picture is black: what it shows must then
-    be covered, and no camera can be explained by leaving a place half transparent"""
+    """Draw backdrop and keyframes before a colour at random in each iteration, but where a picture is black: what it
+    shows must then be covered, and no camera can be explained by leaving a place half transparent"""
     seed: int = 0
     device: str = "cpu"
     """Who renders and labels: "cpu", or "cuda" (see `packuv.fit.device`); the rest is done by the CPU either way"""
@@ -61,23 +61,21 @@ class SolverOptions(LossOptions):
 
 @dataclass(frozen=True)
 class KeyframeOptions(SolverOptions):
-    """What all keyframes read."""
+    """What the backdrop and all keyframes read."""
 
-    key_births: int = 5_000
-    """Gaussians born inside the hull of what changed since the last keyframe"""
     start: StartOptions = field(default_factory=StartOptions)
 
 
 @dataclass(frozen=True)
 class FirstOptions(KeyframeOptions):
-    """What the first keyframe reads."""
+    """What the backdrop reads, or the first keyframe without one; called the first fit below."""
 
     iterations: int = 1500
-    """Of the first keyframe, one camera each"""
+    """Of the first fit, one camera each"""
     coarse_share: float = 0.1
-    """Share of the first keyframe's iterations on pictures of half the size"""
+    """Share of the first fit's iterations on pictures of half the size"""
     float_share: float = 0.7
-    """Share of the first keyframe's iterations before the quantizer is fixed"""
+    """Share of the first fit's iterations before the quantizer is fixed"""
     sh_degree: int = 0
     """View dependence at most: 0 none, 1 to 3 as in 3D Gaussian Splatting; bands that gain nothing are dropped"""
     sh_gain: float = 0.01
@@ -91,9 +89,14 @@ class FirstOptions(KeyframeOptions):
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
-            raise ValueError(f"the first keyframe needs an iteration at least, but iterations is {self.iterations}")
+            raise ValueError(f"the first fit needs an iteration at least, but iterations is {self.iterations}")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"the SH degree must be 0 to 3, but is {self.sh_degree}")
+        if not 0 < self.backdrop_share < 1:
+            raise ValueError(
+                "backdrop_share must lie between 0 and 1, so that there is room for what moves, "
+                f"but is {self.backdrop_share}"
+            )
 
 
 @dataclass(frozen=True)
@@ -105,10 +108,12 @@ class ChangeOptions(SolverOptions):
 
 @dataclass(frozen=True)
 class NextOptions(KeyframeOptions, ChangeOptions):
-    """What a keyframe after the first reads."""
+    """What a keyframe reads that starts from the backdrop or from another one."""
 
+    key_births: int = 5_000
+    """Gaussians born inside the hull of what differs from where the keyframe starts"""
     key_iterations: int = 500
-    """Of each later keyframe"""
+    """Of each keyframe"""
 
     def __post_init__(self) -> None:
         if self.key_iterations < 1:

@@ -59,7 +59,9 @@ class Solver:
     ) -> None:
         """`backdrop` is drawn with the model's Gaussians, and is not changed."""
         self.model = model
-        self.backdrop = backdrop or Backdrop(rows_of(model.gaussians, slice(0, 0)), bounds.near)
+        if backdrop is None:
+            backdrop = Backdrop(rows_of(model.gaussians, slice(0, 0)), bounds.near, options.device)
+        self.backdrop = backdrop
         self.rows = np.ones(len(model), bool)
         """Which Gaussians may change"""
         self.gradient = ScreenGradient(len(model))

@@ -89,7 +89,7 @@ class Light:
     def of(self, cameras: Sequence[str], instants: int) -> np.ndarray | None:
         """Light times exposure, float32 [instants, C, 3], as `Views` takes it; None where nothing changes.
 
-        Instants after those that were measured are taken for steady: nobody looks at them.
+        Instants after those that were measured are taken for steady: do not look at them.
         """
         if self.steady:
             return None

@@ -147,7 +147,8 @@ def promoted(losses: Sequence[float], options: KeyframeOptions) -> int | None:
 
 
 def fitting_order(pictures: Sequence[int]) -> tuple[int, list[tuple[int, int]]]:
-    """The keyframe that is fitted first, and then each of the others with the one that it is fitted from.
+    """Without a backdrop: the keyframe that is fitted first, and then each of the others with the one that it is
+    fitted from.
 
     `pictures` counts the cameras that filmed each keyframe. The chain starts where most did, at the first of equals,
     because what a camera shows of the still part of a scene must be known before that part is kept; from there it

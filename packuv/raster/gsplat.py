@@ -8,6 +8,7 @@ and saves no time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -50,6 +51,11 @@ class GpuLayer(Composed):
 
     gaussians: Gaussians
     sh_degree: int
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds beside the Gaussians."""
+        return 0
 
 
 def compose(
@@ -121,7 +127,7 @@ def backward(
     whole = [torch.zeros_like(a) if g is None else g for g, a in zip(found, rendering._inputs, strict=True)]
     whole[5] = whole[5].reshape(-1, 2)  # [1, N, 2] of one camera; those of a layer come first
     whole[5] = whole[5][len(whole[5]) - len(whole[0]) :]
-    finite = torch.stack([g.reshape(len(g), -1).isfinite().all(1) for g in whole]).all(0)
+    finite = torch.stack([g.reshape(len(g), math.prod(g.shape[1:])).isfinite().all(1) for g in whole]).all(0)
     keep = finite if rows is None else finite & torch.as_tensor(rows, device=device)
     kept = [_array(torch.where(keep.reshape(-1, *[1] * (g.ndim - 1)), g, 0)) for g in whole]
     return Gradients(kept[0], kept[1], kept[2], kept[3], kept[4], kept[5], int((~finite).sum()))

@@ -111,7 +111,7 @@ class FrameScore:
     """Of the render as the camera would film it, as are all but `raw_db` and `own_db`"""
     ssim: float
     raw_db: float | None = None
-    """Of the render in the rig's colours"""
+    """Of the render in the rig's colours, in the light of the instant"""
     own_db: float | None = None
     """With the one gain per channel that fits this picture best"""
     moving_db: float | None = None

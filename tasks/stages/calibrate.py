@@ -234,8 +234,9 @@ class FindPoints(Stage):
     def build(self, work: Work) -> Notes:
         footage, options = Footage(self.take, work.site), self.options
         rig, watch = footage.load_rig(), footage.watch_for_log()
-        count = len(footage.load_groups().times_ns)
-        chosen = [0, *(instant for instant in options.more_instants if 0 < instant < count)]
+        light, count = footage.load_light(), len(footage.load_groups().times_ns)
+        known = count if light is None else len(light.light)
+        chosen = [0, *(instant for instant in options.more_instants if 0 < instant < min(known, count))]
         unseen = [name for name in rig.names if name not in self.fitted]
         kept = _KeptPictures(work.scratch, rig.names)
 
@@ -253,7 +254,6 @@ class FindPoints(Stage):
             rig.save(work.out / RIG)
             return {"points": 0, "balanced": False, "reason": str(problem), "log_like": watch.suspects}
         work.progress(0, 1, "balancing colours")
-        light = footage.load_light()
         factors = None if light is None else light.of(rig.names, count)
         factors = None if factors is None else factors[chosen]
         points = _steady(points, rig.names, factors)

@@ -1,4 +1,4 @@
-"""Fit: the chain of keyframes, and the frames between them segment by segment."""
+"""Fit: the backdrop, keyframes, and the frames between them segment by segment."""
 
 from __future__ import annotations
 

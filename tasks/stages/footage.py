@@ -84,7 +84,7 @@ class Footage:
         return Rig.load(self.site.path(self.take.rig) / RIG).select(self.take.cameras)
 
     def open_views(self, cameras: Sequence[str] | None = None) -> Views:
-        """Undistorted, colour-balanced pictures of `cameras`, by default all of this take."""
+        """Undistorted pictures as filmed, and the responses, of `cameras`, by default all of this take."""
         names = self.take.cameras if cameras is None else tuple(cameras)
         groups, rig = self.load_groups(), self.load_rig()
         columns = [groups.cameras.index(name) for name in names]

@@ -54,10 +54,10 @@ class MeasureLight(Stage):
 def why_steady(facts: Notes) -> str:
     """For people."""
     spread, left = facts["spread"], facts["left"]
-    if left is None:
-        return "fewer than two fitted cameras tell it, so none confirms the other"
     if spread < facts["least"]:
         return f"it changes by {spread:.2%}, less than {facts['least']:.2%}"
+    if left is None:
+        return "fewer than two fitted cameras tell it, so none confirms the other"
     return f"light that some cameras see leaves {left:.0%} of the change that others see"
 
 

@@ -173,3 +173,7 @@ def test_a_scene_of_one_frame_and_an_exact_one_have_no_areas():
 def test_what_is_kept_of_a_picture_is_small():
     seen, _ = watch([flat(0.1)])
     assert seen.blocks[0].shape == (round(BLOCKS * HEIGHT / WIDTH), BLOCKS)
+
+
+def test_a_camera_without_pictures_has_none_where_nothing_moves():
+    assert list(_Watch().never_moving()) == []

@@ -18,12 +18,14 @@ import torch
 
 from packuv.camera import PinholeCamera
 from packuv.fit import device
+from packuv.fit.backdrop import Backdrop, joined
 from packuv.fit.device import choose_device, drawn_differently, labelled_differently, obstacle
 from packuv.fit.model import Model
 from packuv.fit.options import FitOptions
 from packuv.fit.shots import Shot
 from packuv.fit.solver import Solver
 from packuv.fit.start.bounds import Bounds
+from packuv.gaussians.floats import rows_of
 from packuv.raster import RasterOptions, compose, gradients, render, tile_shape
 from tests.support.dense_raster import BACKGROUND, blend, camera, ellipses, scene, sh_colour, upstream
 from tests.support.needs import needs
@@ -120,6 +122,19 @@ def test_a_layer_is_drawn_with_what_changes_and_gets_no_gradient(gsplat):
         truth = getattr(expected, name)
         assert getattr(got, name).shape == truth.shape
         assert np.linalg.norm(getattr(got, name) - truth) < 1e-4 * np.linalg.norm(truth)
+
+
+def test_a_backdrop_has_layers_on_either_device(gsplat):
+    for stand_in in ("cpu", STAND_IN):
+        backdrop = Backdrop(scene(60), OPTIONS.near, stand_in)
+        layer = backdrop.layer(camera(), None)
+        assert backdrop.layer(camera(), None) is layer
+        moving = scene(20, seed=1)
+        plain = render(joined(scene(60), moving), camera(), options=replace(OPTIONS, device=stand_in))
+        drawn = render(moving, camera(), options=replace(OPTIONS, device=stand_in), over=layer)
+        assert np.abs(drawn.colour - plain.colour).max() < 2e-4
+    nothing = rows_of(scene(4), slice(0, 0))
+    assert Backdrop(nothing, OPTIONS.near).layer(camera(), None) is None
 
 
 def test_tiles_that_are_not_asked_for_show_background_and_give_no_gradient(gsplat):

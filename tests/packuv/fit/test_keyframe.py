@@ -217,6 +217,15 @@ def test_what_stands_before_the_backdrop_is_born_for_each_keyframe(views, stills
     assert masked_error(views, shown, near, masks) < 0.9 * masked_error(views, plain, near, masks)
 
 
+def test_silhouettes_that_too_few_cameras_have_give_birth_to_nothing(views, stills, backdrop):
+    known = np.ones_like(stills[0].known)
+    shown = [dataclasses.replace(still, pixels=views.steady(still.camera, 0), known=known) for still in stills]
+    shown[0] = dataclasses.replace(shown[0], pixels=255 - shown[0].pixels)  # a flickering screen, say
+    found = fit_next(backdrop, views, 0, stills=shown, motion=MOTION, options=OPTIONS)
+    assert same(found.gaussians, backdrop.gaussians)
+    assert found.figures["iterations"] == 0
+
+
 def test_a_backdrop_needs_two_cameras(views, stills):
     with pytest.raises(ValueError, match="what stands still in two cameras, but is given 1"):
         fit_backdrop(views, stills[:1], points=None, options=OPTIONS)

@@ -30,7 +30,7 @@ def shots(shift: float) -> list[Shot]:
 
 def settled(shots: list[Shot], limit: int, usual: float = np.inf, **changes: Any) -> tuple[Solver, float | None, int]:
     """A solver that has settled on the shots, its loss, and the iterations that it took."""
-    options = FitOptions(random_background=False, frame_iterations=limit, **changes)
+    options = FitOptions(random_background=False, frame_iterations=limit, frame_rate_scale=4.0, **changes)
     tried = solver(**changes)
     losses, count = tried.settle(shots, options, usual=usual)
     return tried, None if losses is None else sum(losses.values()), count
