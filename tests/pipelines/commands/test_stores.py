@@ -54,7 +54,7 @@ def test_a_quota_that_cannot_be_held_is_told_by_the_exit_code(runs, capsys):
     assert [item["why"] for item in folder["sequences"][0]["gone"]] == ["superseded", "over quota"]
     assert [sequence["state"] for sequence in folder["sequences"]] == ["finished", "unfinished"]
     assert main(["clean", str(runs), "--quota", "500kB"]) == FAILED
-    assert "the quota is exceeded: only motion, background, seam, key, segment of finished" in capsys.readouterr().out
+    assert "the quota is exceeded: only motion, background, seam, backdrop, key, segment of" in capsys.readouterr().out
 
 
 def test_a_sequence_that_is_processed_is_named(runs, capsys):

@@ -146,4 +146,4 @@ def test_a_killed_run_does_not_stay_running(tmp_path, capsys):
         process.wait()
     found = status(tmp_path, capsys)["dance"]
     assert found["state"] == "killed"
-    assert found["doing"].startswith("killed at fit keyframe")
+    assert found["doing"].startswith("killed at fit backdrop")
