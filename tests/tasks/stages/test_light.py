@@ -88,6 +88,7 @@ def header_of(take: Take, site: Site) -> SceneHeader:
     key = KeyState(
         0,
         quantizer.decode(Codes(np.zeros((1, 3), np.uint16), np.zeros((1, columns), np.uint8))),
+        0,
         quantizer,
         Bounds(np.zeros(3), 3.0, 0.1),
         {},
@@ -160,9 +161,10 @@ def test_points_have_the_colours_of_steady_light():
         colour=np.array([[0.2] * 3, [0.8] * 3, [0.4] * 3, [np.nan] * 3], np.float32),
         matches=report,
     )
-    steady = _steady(points, light, np.array([0, 2]), 3)
+    factors = light.of(("c", "a", "b"), 3)[[0, 2]]
+    steady = _steady(points, ("c", "a", "b"), factors)
     assert np.allclose(steady.colour[:, 0], [0.2, 0.2, 0.2, np.nan], equal_nan=True)
-    assert _steady(points, None, np.array([0, 2]), 3) is points
+    assert _steady(points, ("c", "a", "b"), None) is points
     assert steady.colour.dtype == points.colour.dtype
 
 
