@@ -12,7 +12,8 @@ READY := .venv/.ready
 
 demo: $(READY)
 	$(BIN)/packuv simulate runs/demo/capture --cameras 8 --frames 24 --size 320x180 --seed 7 --rig front
-	$(BIN)/packuv run runs/demo/capture --out runs/demo --preset draft --set fit.iterations=1200 --set fit.density.cap=30000
+	$(BIN)/packuv run runs/demo/capture --out runs/demo --preset draft \
+		--set fit.iterations=1800 --set fit.key_iterations=800 --set fit.density.cap=30000
 
 test: $(READY)
 	$(BIN)/python -m pytest $(PYTEST)
