@@ -56,10 +56,9 @@ class KeyframeOptions:
     segment is fitted again from the end of the earlier one, after it instead of beside it; 0: never"""
 
     def __post_init__(self) -> None:
-        if self.promotion != 0 and not self.promotion > 1:
-            raise ValueError(f"promotion must be a factor above 1, or 0 for never, but is {self.promotion}")
-        if not self.seam >= 0:
-            raise ValueError(f"seam must be a factor, or 0 for never, but is {self.seam}")
+        for name, factor in (("promotion", self.promotion), ("seam", self.seam)):
+            if factor != 0 and not factor > 1:
+                raise ValueError(f"{name} must be a factor above 1, or 0 for never, but is {factor}")
         if self.smoothing < 1 or self.smoothing % 2 == 0 or self.separation < 1 or (self.peaks or 0) < 0:
             raise ValueError(
                 "smoothing must be odd and positive, separation positive and peaks not negative, but they are "

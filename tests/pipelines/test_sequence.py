@@ -160,20 +160,37 @@ def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
     assert redone() == set()  # back to what was there at first
 
 
-def test_side_by_side_a_border_that_shows_is_fitted_again_from_the_frame_before_it(first, capture, tmp_path):
+def seam_of(outcome: Outcome) -> float:
+    """Flicker at the scene's border over that elsewhere, for the camera that was held out."""
+    metrics = outcome.folder / "store" / artefacts(outcome)["evaluate"] / "metrics.json"
+    return json.loads(metrics.read_text())["seam"]
+
+
+def test_side_by_side_keyframes_start_from_the_backdrop(first, capture, tmp_path):
     outcome, _ = first
     shutil.copytree(outcome.folder / "store", tmp_path / "tiny" / "store")
+    settings = {**SETTINGS, "keyframes": {**SETTINGS["keyframes"], "seam": 0}}
+    apart, _ = run(request(capture, tmp_path, settings=settings, jobs=2))
+    fits = {label for label in made(apart) if label.startswith("fit")}
+    assert fits == {"fit keyframe 3", LAST}  # what comes first is the same, one at a time or side by side
 
-    def fitted(limit: float) -> tuple[set[str], Outcome]:
-        settings = {**SETTINGS, "keyframes": {**SETTINGS["keyframes"], "seam": limit}}
-        found, _ = run(request(capture, tmp_path, settings=settings, jobs=2))
+
+def test_side_by_side_a_border_that_shows_is_fitted_again_from_the_frame_before_it(capture, tmp_path):
+    """Without a backdrop, whose tiny scene has no border that shows."""
+
+    def fitted(limit: float, jobs: int = 2) -> tuple[set[str], Outcome]:
+        fit = {**SETTINGS["fit"], "background": {"instants": 0}}
+        settings = {**SETTINGS, "fit": fit, "keyframes": {**SETTINGS["keyframes"], "seam": limit}}
+        found, _ = run(request(capture, tmp_path, settings=settings, jobs=jobs))
         return {label for label in made(found) if label.startswith("fit")}, found
 
+    _, outcome = fitted(0, jobs=1)
     fits, apart = fitted(0)
     assert fits == {"fit keyframe 3", LAST}  # what comes first is the same, one at a time or side by side
-    fits, mended = fitted(0.01)
+    fits, mended = fitted(1.01)
     assert fits == set()  # what goes on from the frame before is what one at a time makes
     assert artefacts(mended)[LAST] == artefacts(outcome)[LAST] != artefacts(apart)[LAST]
+    assert seam_of(mended) < seam_of(apart)
 
 
 def test_a_full_disk_is_refused_before_the_work(capture, tmp_path, monkeypatch):
