@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from packuv.camera import PinholeCamera
-from packuv.colour import linear_from_srgb, lit, srgb_from_linear
+from packuv.colour import GAMMA, OFFSET, linear_from_srgb, lit, srgb_from_linear
 from packuv.files import save_json
 from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
@@ -213,9 +213,9 @@ def with_own_gain(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
     Both are float32 [3, H, W], sRGB. sRGB is (light ^ (1 / 2.4) * 1.055) - 0.055 but for the darkest tones, so a gain
     is a factor on sRGB + 0.055, and least squares give that factor at once, in the scale on which PSNR counts.
     """
-    shown, wanted = picture + np.float32(0.055), truth + np.float32(0.055)
+    shown, wanted = picture + np.float32(OFFSET), truth + np.float32(OFFSET)
     factor = (shown * wanted).sum(axis=(1, 2)) / (shown * shown).sum(axis=(1, 2))
-    return srgb_from_linear(linear_from_srgb(picture) * (factor**2.4)[:, None, None]).astype(np.float32)
+    return srgb_from_linear(linear_from_srgb(picture) * (factor**GAMMA)[:, None, None]).astype(np.float32)
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:

@@ -43,7 +43,7 @@ class Response:
         """
         (k1, k2), (m2, m4) = lens.shading, shading_means(lens.pinhole)
         level = -np.log(lens.gains) + (0 if light is None else light) - k1 * m2 - k2 * m4
-        red, green, blue = (float(factor) for factor in np.exp(level / GAMMA))
+        red, green, blue = (float(factor) for factor in colour.light_factors(level))
         corner = corner_radius(lens.pinhole)
         grid = camera.cx, camera.cy, 1 / (camera.fx * corner), 1 / (camera.fy * corner)
         return cls((red, green, blue), (k1 / GAMMA, k2 / GAMMA), grid)

@@ -19,9 +19,10 @@ import cv2
 import numpy as np
 
 from packuv.camera import PinholeCamera
+from packuv.colour import OFFSET, light_factors
 from packuv.footage.lens import LensCamera, undistorted_camera, undistortion_maps
 from packuv.footage.reader import FrameReader
-from packuv.footage.response import GAMMA, OFFSET, Response
+from packuv.footage.response import Response
 from packuv.footage.transfer import Transfer
 
 
@@ -105,7 +106,7 @@ class Views:
         pixels = self.pixels(camera, instant, remember=remember)
         if pixels is None or self.light is None or not self.light[instant, camera].any():
             return pixels
-        factors = np.exp(self.light[instant, camera].astype(np.float64) / GAMMA)
+        factors = light_factors(self.light[instant, camera])
         table = (np.arange(256)[:, None] / 255 + OFFSET) / factors - OFFSET  # [256, 3]
         steady: np.ndarray = cv2.LUT(pixels, np.rint(255 * np.clip(table, 0, 1)).astype(np.uint8)[None])
         return steady
