@@ -23,6 +23,7 @@ import av
 import numpy as np
 
 from bench import command
+from packuv.budget import Budget
 from packuv.camera import PinholeCamera
 from packuv.fit.density import DensityOptions
 from packuv.fit.frames import fit_segment
@@ -131,7 +132,7 @@ def film(
     for instant, index in missing:
         numbers[instant, index] = -1
     videos = {camera.name: folder / f"{camera.name}.mkv" for camera in cameras}
-    return Views(videos, numbers, [LensCamera(camera) for camera in cameras], cache_bytes=CACHE_BYTES)
+    return Views(videos, numbers, [LensCamera(camera) for camera in cameras], budget=Budget(CACHE_BYTES))
 
 
 def picture_of(gaussians: Gaussians, camera: PinholeCamera, *, near: float = 0.1) -> np.ndarray:

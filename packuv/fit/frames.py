@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from packuv.each import as_bits
 from packuv.files import save_json, save_npz
 from packuv.fit.backdrop import Backdrop
 from packuv.fit.keyframe import DEAD_CODE, KeyState
@@ -43,10 +44,11 @@ def fit_segment(
     """
     if instants.start != key.instant:
         raise ValueError(f"a segment starts at its keyframe, instant {key.instant}, not at {instants.start}")
-    track, backdrop = Track.resume(key, options, scratch), key.open_backdrop(options.device)
+    track, backdrop = Track.resume(key, options, scratch), key.open_backdrop(options.device, views.budget)
     ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
     for instant in instants[1 + len(track.frames) :]:
-        masks = [motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras]
+        views.forget()
+        masks = as_bits(motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras)
         optical_flows = [motion.optical_flow(motion.names.index(camera.name), instant) for camera in views.cameras]
         track.add(_fit_frame(track.model, key, backdrop, views, instant, masks, optical_flows, options))
         track.checkpoint()

@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from packuv.budget import Budget
+from packuv.each import Each, as_bits, packed
 from packuv.files import save_json, save_npz
 from packuv.fit.backdrop import Backdrop, joined
 from packuv.fit.losses import photometric_loss
@@ -73,10 +75,10 @@ class KeyState:
         """What frames of the segment may be expected to reach; infinite where the fit saw more than what changes."""
         return self.figures["loss"] if self.backdrop and self.figures.get("loss") else math.inf
 
-    def open_backdrop(self, device: str) -> Backdrop:
-        """The backdrop, to draw over."""
+    def open_backdrop(self, device: str, budget: Budget) -> Backdrop:
+        """The backdrop, to draw over; the budget is for its layers."""
         still = rows_of(self.gaussians, slice(0, self.backdrop))
-        return Backdrop(self.quantizer.decode(self.quantizer.encode(still)), self.bounds.near, device)
+        return Backdrop(self.quantizer.decode(self.quantizer.encode(still)), self.bounds.near, device, budget)
 
     def save(self, folder: Path) -> None:
         """Write state.npz and key.json."""
@@ -115,7 +117,7 @@ def fit_backdrop(
     """
     if len(stills) < 2:
         raise ValueError(f"a backdrop needs what stands still in two cameras, but is given {len(stills)}")
-    shots = [_still_shot(views, still) for still in stills]
+    shots = [_still_shot(views, stills, index) for index in range(len(stills))]
     room = replace(options.density, cap=round(options.backdrop_share * options.density.cap))
     state = _fit_all(views, shots, None, points, replace(options, density=room), progress)
     drawn = state.quantizer.encode(state.gaussians).attributes[:, OPACITY] > DEAD_CODE
@@ -142,7 +144,7 @@ def _fit_all(
     started = time.monotonic()
     bounds = find_bounds(views.cameras, near_share=options.near_share)
     rng = np.random.default_rng([options.seed, 0 if instant is None else instant, 0])
-    cameras, targets = [shot.camera for shot in shots], [shot.response.undone(shot.target) for shot in shots]
+    cameras, targets = [shot.camera for shot in shots], Each(lambda index: _undone(shots[index]), len(shots))
     shell = sweep_shell(cameras, targets, bounds=bounds, options=options.shell) if options.shell.enabled else None
     start = first_gaussians(cameras, targets, bounds=bounds, surface=_surface(shell, points, options),
                             options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
@@ -155,6 +157,7 @@ def _fit_all(
     if shell is not None:
         depths = (shell.depths(camera, index, bounds.near) for index, camera in enumerate(cameras))
         shots = [replace(shot, depths=known) for shot, known in zip(shots, depths, strict=True)]
+        del shell
     solver.run(shots, floating - solver.done, of=total, grow_from=grow_from, ticks=ticks)
     solver.keep(solver.worth_keeping())
     model.gaussians = with_canonical_axes(model.gaussians)
@@ -187,7 +190,7 @@ def fit_next(
     bounds, quantizer = previous.bounds, previous.quantizer
     rng = np.random.default_rng([options.seed, instant, 1])
     model = Model(previous.foreground)
-    solver = Solver(model, bounds, options, rng, previous.open_backdrop(options.device))
+    solver = Solver(model, bounds, options, rng, previous.open_backdrop(options.device, views.budget))
     solver.fix(quantizer)
     standing = _standing(views, instant, stills, motion)
     masks = standing if previous.instant is None else _changes(views, previous.instant, instant, motion)
@@ -200,7 +203,7 @@ def fit_next(
         solver.keep(~gone | _inside(model.gaussians, views, standing, bounds, options))
     solver.free(moving_rows(model.gaussians, quantizer, views, masks, bounds, options))
     solver.make_room(shots)
-    seen = [mask if alone is None else alone for alone, mask in zip(standing, masks, strict=True)]
+    seen = Each(lambda index: masks[index] if standing[index] is None else standing[index], len(masks))
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
     if not solver.rows.any():  # nothing that enough cameras see
@@ -218,24 +221,36 @@ def _whole(previous: KeyState, model: Model) -> Gaussians:
     return joined(rows_of(previous.gaussians, slice(0, previous.backdrop)), model.gaussians)
 
 
-def _changes(views: Views, first: int, last: int, motion: MotionOptions) -> list[np.ndarray | None]:
-    return [changed_between(views, camera, first, last, motion) for camera in range(len(views.cameras))]
+def _changes(views: Views, first: int, last: int, motion: MotionOptions) -> Sequence[np.ndarray | None]:
+    return as_bits(changed_between(views, camera, first, last, motion) for camera in range(len(views.cameras)))
 
 
-def _still_shot(views: Views, still: Still) -> Shot:
-    response = views.response(still.camera, None)
-    return Shot(views.cameras[still.camera], as_planes(still.pixels), response, known=still.known)
+def _still_shot(views: Views, stills: Sequence[Still], index: int) -> Shot:
+    still = stills[index]
+    camera, response = views.cameras[still.camera], views.response(still.camera, None)
+    return Shot(camera, lambda: as_planes(stills[index].pixels), response, known=packed(still.known))
 
 
-def _standing(views: Views, instant: int, stills: Sequence[Still], motion: MotionOptions) -> list[np.ndarray | None]:
+def _undone(shot: Shot) -> np.ndarray:
+    """The picture in the rig's common colour, float32 [3, H, W]."""
+    return shot.response.undone(shot.target)
+
+
+def _standing(
+    views: Views, instant: int, stills: Sequence[Still], motion: MotionOptions
+) -> Sequence[np.ndarray | None]:
     """Where each camera's picture shows what its background lacks, or nobody knows that, bool [H, W]; None without
     one of the two pictures."""
-    masks: list[np.ndarray | None] = [None] * len(views.cameras)
-    for still in stills:
-        pixels = views.steady(still.camera, instant)
-        if pixels is not None:
-            masks[still.camera] = difference(still.pixels, pixels, motion) | ~still.known
-    return masks
+    numbers = {still.camera: index for index, still in enumerate(stills)}
+
+    def mask(camera: int) -> np.ndarray | None:
+        pixels = views.steady(camera, instant) if camera in numbers else None
+        if pixels is None:
+            return None
+        still = stills[numbers[camera]]
+        return np.asarray(difference(still.pixels, pixels, motion) | ~still.known)
+
+    return as_bits(mask(camera) for camera in range(len(views.cameras)))
 
 
 def _inside(
@@ -246,11 +261,22 @@ def _inside(
     options: KeyframeOptions,
 ) -> np.ndarray:
     """Gaussians in the hull of the masks, bool [N]; none if too few cameras have one."""
-    seeing = [(camera, mask) for camera, mask in zip(views.cameras, masks, strict=True) if mask is not None]
+    seeing = [index for index, mask in enumerate(masks) if mask is not None]
     if len(seeing) < min(options.start.min_views, len(views.cameras)):
         return np.zeros(len(gaussians), bool)
-    cameras, known = [pair[0] for pair in seeing], [pair[1] for pair in seeing]
+    cameras, known = [views.cameras[index] for index in seeing], _those(masks, seeing)
     return in_hull(gaussians.means.astype(np.float64), cameras, known, bounds=bounds, options=options.start)
+
+
+def _those(things: Sequence[np.ndarray | None], places: Sequence[int]) -> Each[np.ndarray]:
+    """Those at some places, where there are some."""
+
+    def one(index: int) -> np.ndarray:
+        thing = things[places[index]]
+        assert thing is not None, "nothing is at a place where something was"
+        return thing
+
+    return Each(one, len(places))
 
 
 def _surface(shell: Shell | None, points: Points | None, options: FirstOptions) -> Points:
@@ -273,7 +299,7 @@ def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, o
     def loss(degree: int) -> float:
         cut = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
         values = []
-        for shot in shots:
+        for shot in map(Shot.opened, shots):
             picture = shot.response.shown(render(cut, shot.camera, options=raster, arena=arena).colour)
             values.append(photometric_loss(picture, shot.wanted(picture), options=options.photometric).value)
         return float(np.mean(values))
@@ -315,10 +341,10 @@ def _hull_gaussians(
     sh_degree: int,
 ) -> Gaussians:
     """New Gaussians inside the hull of the masks: what moved there since the last keyframe has none yet."""
-    found = [(camera, views.picture(i, instant), masks[i]) for i, camera in enumerate(views.cameras)]
-    seeing = [(camera, picture, mask) for camera, picture, mask in found if picture is not None and mask is not None]
-    points = hull_points([s[0] for s in seeing], [s[1] for s in seeing], [s[2] for s in seeing], bounds=bounds,
-                         options=options.start, count=options.key_births, rng=rng)  # fmt: skip
+    seeing = [index for index, mask in enumerate(masks) if mask is not None and views.has(index, instant)]
+    pictures = Each(lambda camera: views.picture(camera, instant), len(views.cameras))
+    points = hull_points([views.cameras[index] for index in seeing], _those(pictures, seeing), _those(masks, seeing),
+                         bounds=bounds, options=options.start, count=options.key_births, rng=rng)  # fmt: skip
     spacing = neighbour_distance(points.xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 0.02 * bounds.radius)
     born = round_gaussians(points.xyz, points.rgb, scale, opacity=options.start.opacity, sh_degree=sh_degree)

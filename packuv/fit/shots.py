@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -18,38 +19,61 @@ from packuv.footage.response import PLAIN
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import Gaussians
 
+Later = Callable[[], np.ndarray]
+"""Reads an array when it is needed: of many cameras one at a time is whole in memory"""
+
 
 @dataclass(frozen=True)
 class Shot:
     """One picture to explain."""
 
     camera: PinholeCamera
-    target: np.ndarray
+    source: np.ndarray | Later
     """float32 [3, H, W] in [0, 1], as filmed"""
     response: Response = PLAIN
     """What the camera makes of the rig's colours"""
     tiles: np.ndarray | None = None
     """bool [tiles_y, tiles_x] where the picture counts; None: everywhere"""
-    known: np.ndarray | None = None
+    known: np.ndarray | Later | None = None
     """bool [H, W] where the picture counts within these tiles; None: everywhere"""
     depths: SparseDepth | None = None
     """Where the surface is known to be"""
 
+    @property
+    def target(self) -> np.ndarray:
+        """float32 [3, H, W] in [0, 1], as filmed."""
+        return self.source() if callable(self.source) else self.source
+
+    @property
+    def certain(self) -> np.ndarray | None:
+        """What is `known`, bool [H, W]."""
+        return self.known() if callable(self.known) else self.known
+
+    def opened(self) -> Shot:
+        """The same with its arrays in memory."""
+        return replace(self, source=self.target, known=self.certain)
+
     def wanted(self, picture: np.ndarray) -> np.ndarray:
         """The target, float32 [3, H, W]; what is not known is taken for right as `picture` shows it."""
-        return self.target if self.known is None else np.where(self.known, self.target, picture)
+        known = self.certain
+        return self.target if known is None else np.where(known, self.target, picture)
 
 
 def halved(shot: Shot) -> Shot:
-    """The same picture at half its size."""
+    """The same picture at half its size, made when it is needed."""
     camera = shot.camera.scaled(max(16, shot.camera.width // 2), max(16, shot.camera.height // 2))
     size = camera.width, camera.height
-    small = cv2.resize(shot.target.transpose(1, 2, 0), size, interpolation=cv2.INTER_AREA)
-    known = None
-    if shot.known is not None:
-        known = cv2.resize(shot.known.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+    def target() -> np.ndarray:
+        return np.stack([cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in shot.target])
+
+    def known() -> np.ndarray:
+        mask = shot.certain
+        assert mask is not None
+        return np.asarray(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
+
     response = shot.response.scaled(camera.width / shot.camera.width, camera.height / shot.camera.height)
-    return Shot(camera, np.ascontiguousarray(small.transpose(2, 0, 1)), response, known=known)
+    return Shot(camera, target, response, known=None if shot.known is None else known)
 
 
 def find_shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | None = None) -> list[Shot]:
@@ -58,13 +82,18 @@ def find_shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | 
     for index, camera in enumerate(views.cameras):
         if masks is not None and (mask := masks[index]) is not None and not mask.any():
             continue
-        target = views.filmed(index, instant)
-        if target is not None:
-            shots.append(Shot(camera, target, views.response(index, instant)))
+        if views.has(index, instant):
+            shots.append(Shot(camera, partial(_filmed, views, index, instant), views.response(index, instant)))
     if masks is None and len(shots) < 2:
         raise ValueError(f"instant {instant} has pictures of {len(shots)} cameras to fit, but needs two or more; "
                          "choose another range with --frames")  # fmt: skip
     return shots
+
+
+def _filmed(views: Views, camera: int, instant: int) -> np.ndarray:
+    filmed = views.filmed(camera, instant)
+    assert filmed is not None, "who lacks the picture has no shot"
+    return filmed
 
 
 def moving_rows(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -61,6 +60,7 @@ class Solver:
         self.model = model
         if backdrop is None:
             backdrop = Backdrop(rows_of(model.gaussians, slice(0, 0)), bounds.near, options.device)
+        backdrop.forget()
         self.backdrop = backdrop
         self.rows = np.ones(len(model), bool)
         """Which Gaussians may change"""
@@ -70,7 +70,6 @@ class Solver:
         self.bounds = bounds
         self.cap = max(0, options.density.cap - len(self.backdrop))
         """Gaussians of the model at most"""
-        self._layers: dict[int, Any] = {}
         self._options = options
         self._rng = rng
         self._order: list[int] = []
@@ -130,7 +129,7 @@ class Solver:
         With `grow_from` Gaussians in the beginning, their number grows towards the cap; without it stays.
         """
         losses: list[Losses] = []
-        self._order, self._layers = [], {}
+        self._order = []
         density = self._options.density
         for _ in range(count):
             index, opaque = self._next(shots), self._options.random_background
@@ -197,17 +196,15 @@ class Solver:
         scale: float = 1.0,
         opaque: bool = False,
     ) -> Losses:
-        options, shot = self._options, shots[index]
+        options, shot = self._options, shots[index].opened()
         raster = RasterOptions(near, device=options.device)
-        if index not in self._layers:
-            self._layers[index] = self.backdrop.layer(shot.camera, shot.tiles)
         rendering = render(
             self._decoded(),
             shot.camera,
             options=raster,
             tiles=shot.tiles,
             arena=self._arena,
-            over=self._layers[index],
+            over=self.backdrop.layer(shot.camera, shot.tiles),
         )
         moving = self.rows & (rendering.visible > 0)
         behind = self._behind(shot.target) if opaque else None

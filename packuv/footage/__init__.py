@@ -2,11 +2,12 @@
 
 from packuv.footage.lens import LensCamera
 from packuv.footage.light import Light, LightOptions, measure_light
+from packuv.footage.planes import as_planes
 from packuv.footage.reader import FrameReader
 from packuv.footage.response import Response
 from packuv.footage.suspect import looks_like_log
 from packuv.footage.transfer import Transfer
-from packuv.footage.views import Views, as_planes
+from packuv.footage.views import Views
 
 __all__ = [
     "FrameReader",

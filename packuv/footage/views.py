@@ -18,11 +18,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from packuv.budget import Budget
 from packuv.camera import PinholeCamera
 from packuv.colour import OFFSET, light_factors
 from packuv.footage.lens import LensCamera, undistorted_camera, undistortion_maps
+from packuv.footage.planes import as_planes
 from packuv.footage.reader import FrameReader
 from packuv.footage.response import Response
+from packuv.footage.spill import Spill
 from packuv.footage.transfer import Transfer
 
 
@@ -30,7 +33,8 @@ class Views:
     """What a fit and an evaluation see: undistorted pictures by camera and instant, and each camera's response.
 
     A camera is an index into `cameras`, an instant a row of `frames`. Pictures of the last instants stay in memory
-    as bytes, up to `cache_bytes`; reading instants in ascending order decodes every frame once.
+    as bytes as far as the budget goes, the rest on disk where `spill` names a folder for it; reading instants in
+    ascending order decodes every frame once.
     """
 
     cameras: tuple[PinholeCamera, ...]
@@ -45,14 +49,16 @@ class Views:
         max_width: int | None = None,
         transfer: Transfer | None = None,
         light: np.ndarray | None = None,
-        cache_bytes: int = 1 << 30,
+        budget: Budget | None = None,
+        spill: Path | None = None,
         reader: FrameReader | None = None,
     ) -> None:
         """`frames` is int [T, C]: frame number in the video of camera c at instant t, -1 where it has none.
 
         `light`, float [T, C, 3], is the natural logarithm of what the light of the instant and the camera's own
         exposure make of linear light, None where both are steady. Pictures wider than `max_width` are scaled down to
-        it. `transfer` is what the code values of all videos mean, None what each is tagged with. `reader`, which has
+        it. `transfer` is what the code values of all videos mean, None what each is tagged with. `budget` is for
+        pictures and maps of lenses, and for what others hold; None: 1 GiB of its own. `reader`, which has a transfer of
         its own, is shared with others if given.
         Raises ValueError where shapes disagree, a camera has no video, or a lens cannot be undistorted.
         """
@@ -71,11 +77,12 @@ class Views:
         self.reader = reader or FrameReader({name: Path(videos[name]) for name in names}, transfer=transfer)
         self._videos = {name: Path(videos[name]) for name in names}
         undistorted = [undistorted_camera(lens) for lens in lenses]
-        self._maps = [undistortion_maps(lens, camera) for lens, camera in zip(lenses, undistorted, strict=True)]
+        self._undistorted_cameras = undistorted
+        self._maps: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.cameras = tuple(_limited(camera, max_width) for camera in undistorted)
         self._cache: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
-        self._cache_bytes = cache_bytes
-        self._cached_bytes = 0
+        self.budget = Budget(1 << 30) if budget is None else budget
+        self._spill = None if spill is None else Spill(spill)
         self._guard = Lock()
 
     @property
@@ -85,6 +92,10 @@ class Views:
     def __len__(self) -> int:
         """Number of instants, T."""
         return len(self.frames)
+
+    def has(self, camera: int, instant: int) -> bool:
+        """Whether there is a picture."""
+        return bool(self.frames[instant, camera] >= 0)
 
     def filmed(self, camera: int, instant: int) -> np.ndarray | None:
         """Undistorted picture in the camera's own colours, float32 [3, H, W] in [0, 1], or None without a frame."""
@@ -121,11 +132,21 @@ class Views:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
-        pixels = self._undistorted(camera, frame)
+            pixels = self._spill.read(key) if self._spill is not None and key in self._spill else None
+        if pixels is None:
+            pixels = self._undistorted(camera, frame)
         pixels.setflags(write=False)
         if remember:
             self._remember(key, pixels)
         return pixels
+
+    def forget(self) -> None:
+        """Let go of all pictures: the next ones are of other instants."""
+        with self._guard:
+            while self._cache:
+                self.budget.give(self._cache.popitem()[1].nbytes)
+            if self._spill is not None:
+                self._spill.clear()
 
     def to_spec(self) -> dict[str, Any]:
         """Everything `from_spec` needs to build these views in another process, as JSON."""
@@ -159,27 +180,40 @@ class Views:
                 f"camera {lens.name!r}: the video is {pixels.shape[1]}x{pixels.shape[0]}, its calibration "
                 f"{lens.width}x{lens.height}; scale the calibration to the video"
             )
-        if maps := self._maps[camera]:
+        if maps := self._lens_maps(camera):
             pixels = cv2.remap(pixels, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         if target.width != lens.width:
             pixels = cv2.resize(pixels, (target.width, target.height), interpolation=cv2.INTER_AREA)
         return pixels
 
+    def _lens_maps(self, camera: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Kept as far as the budget goes."""
+        if camera in self._maps:
+            return self._maps[camera]
+        maps = undistortion_maps(self.lenses[camera], self._undistorted_cameras[camera])
+        with self._guard:
+            room = maps is not None and camera not in self._maps
+            if maps is not None and room and self.budget.take(sum(part.nbytes for part in maps)):
+                self._maps[camera] = maps
+        return maps
+
     def _remember(self, key: tuple[int, int], pixels: np.ndarray) -> None:
+        """Keep a picture, in place of those that nobody asked for longest."""
         with self._guard:
             if key in self._cache:
                 return
+            while not self.budget.take(pixels.nbytes):
+                if not self._cache:
+                    self._put_aside(key, pixels)
+                    return
+                oldest, lost = self._cache.popitem(last=False)
+                self.budget.give(lost.nbytes)
+                self._put_aside(oldest, lost)
             self._cache[key] = pixels
-            self._cached_bytes += pixels.nbytes
-            while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
-                self._cached_bytes -= self._cache.popitem(last=False)[1].nbytes
 
-
-def as_planes(pixels: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3] as float32 [3, H, W] in [0, 1]."""
-    planes = np.ascontiguousarray(pixels.transpose(2, 0, 1), dtype=np.float32)
-    planes /= 255
-    return planes
+    def _put_aside(self, key: tuple[int, int], pixels: np.ndarray) -> None:
+        if self._spill is not None:
+            self._spill.write(key, pixels)
 
 
 def _packed(frames: np.ndarray) -> str:

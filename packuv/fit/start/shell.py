@@ -186,7 +186,7 @@ def _agreed(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scene radius / distance where cameras agree best [V, U], who sees it [V, U, C], and where that is sure [V, U]."""
     prefer_tbb()
-    grey, views = _grey(pictures), np.stack([view_constants(camera, bounds.near, 0.0) for camera in cameras])
+    grey, views = _grey(cameras, pictures), np.stack([view_constants(camera, bounds.near, 0.0) for camera in cameras])
     shape, count = rays.shape[:2], len(cameras)
     inverse = np.linspace(1 / options.nearest, 1 / options.farthest, options.steps)
     painted = np.empty((count, *shape), np.float32)
@@ -206,9 +206,9 @@ def _agreed(
     return inverse[0] + place * (inverse[1] - inverse[0]), seers, sure
 
 
-def _grey(pictures: Sequence[np.ndarray]) -> np.ndarray:
+def _grey(cameras: Sequence[PinholeCamera], pictures: Sequence[np.ndarray]) -> np.ndarray:
     """Brightness of pictures of any size, float32 [C, H, W], zeros where one is smaller."""
-    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (1, 2))
+    height, width = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
     grey = np.zeros((len(pictures), height, width), np.float32)
     for index, picture in enumerate(pictures):
         grey[index, : picture.shape[1], : picture.shape[2]] = picture.mean(axis=0)

@@ -16,10 +16,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from packuv.budget import Budget
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera, undistorted_camera
+from packuv.footage.planes import as_planes
 from packuv.footage.reader import FrameReader, packet_seconds
-from packuv.footage.views import Views, _packed, _unpacked, as_planes
+from packuv.footage.views import Views, _packed, _unpacked
 from tests.support.needs import needs_ffmpeg
 
 WIDTH, HEIGHT, COUNT = 96, 64, 40
@@ -187,10 +189,11 @@ def test_views_survive_pickle_and_json(video: Path) -> None:
 
 def test_the_cache_keeps_within_its_bytes_and_changes_nothing(video: Path) -> None:
     frames = np.arange(COUNT)[:, None]
-    small = Views({"a": video}, frames, [LensCamera(camera())], cache_bytes=3 * WIDTH * HEIGHT * 3)
+    small = Views({"a": video}, frames, [LensCamera(camera())], budget=Budget(3 * WIDTH * HEIGHT * 3))
     for instant in (0, 1, 2, 3, 1, 0, 9, 3):
         assert np.array_equal(small.pixels(0, instant), numbered()[instant])
-        assert small._cached_bytes == sum(p.nbytes for p in small._cache.values()) <= small._cache_bytes
+        taken = small.budget.total_bytes - small.budget.free_bytes
+        assert taken == sum(p.nbytes for p in small._cache.values()) <= small.budget.total_bytes
 
 
 def test_steady_pictures_undo_the_light_of_the_instant(video: Path) -> None:

@@ -1,0 +1,56 @@
+"""Large things by the hundred, of which one at a time is looked at: made each time that somebody asks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Generic, TypeVar, overload
+
+import numpy as np
+
+Thing = TypeVar("Thing")
+Item = TypeVar("Item", covariant=True)
+
+
+class Each(Sequence[Item], Generic[Item]):
+    """`count` things, made by their index and not kept.
+
+    >>> list(Each(lambda index: index * index, 4))
+    [0, 1, 4, 9]
+    """
+
+    def __init__(self, make: Callable[[int], Item], count: int) -> None:
+        self._make = make
+        self._count = count
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> Item: ...
+    @overload
+    def __getitem__(self, index: slice) -> Each[Item]: ...
+    def __getitem__(self, index: int | slice) -> Item | Each[Item]:
+        if isinstance(index, slice):
+            return self.chosen(range(self._count)[index])
+        return self._make(range(self._count)[index])
+
+    def chosen(self, places: Sequence[int]) -> Each[Item]:
+        """Those at some places."""
+        return Each(lambda index: self._make(places[index]), len(places))
+
+
+def packed(mask: np.ndarray) -> Callable[[], np.ndarray]:
+    """What unpacks a mask, bool [H, W], from bits."""
+    bits, shape = np.packbits(mask), mask.shape
+    return lambda: np.unpackbits(bits, count=shape[0] * shape[1]).view(bool).reshape(shape)
+
+
+def as_bits(masks: Iterable[np.ndarray | None]) -> Each[np.ndarray | None]:
+    """Masks, bool [H, W] each, or None where there is none, kept as bits; asks for each of them once."""
+    unpack = [None if mask is None else packed(mask) for mask in masks]
+
+    def one(index: int) -> np.ndarray | None:
+        read = unpack[index]
+        return None if read is None else read()
+
+    return Each(one, len(unpack))
