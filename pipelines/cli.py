@@ -280,6 +280,9 @@ def _how(command: argparse.ArgumentParser, *, stop: bool) -> None:
     command.add_argument(
         "--frames", type=_range_text, default=":", metavar="A:B", help="instants A to B - 1, counted from 0 (all)"
     )
+    command.add_argument(
+        "--memory-gb", type=float, default=2.0, metavar="GB", help="of each job, for pictures and layers (2)"
+    )
     if stop:
         command.add_argument("--stop-after", choices=STAGES, default="report", metavar="STAGE", help=", ".join(STAGES))
     command.add_argument("--direct", action="store_true", help="run the same stages without the workflow engine")

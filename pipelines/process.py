@@ -202,7 +202,8 @@ def plan_of(request: RunRequest, capture: Capture) -> Plan:
 
 def jobs_of(request: RunRequest) -> Jobs:
     """The jobs of a run, with the cores shared out evenly among those that run side by side."""
-    return Jobs(threads=max(1, cores_of(request) // jobs_at_once(request)))
+    threads = max(1, cores_of(request) // jobs_at_once(request))
+    return Jobs(threads=threads, memory_bytes=round(1e9 * request.memory_gb))
 
 
 def jobs_at_once(request: RunRequest) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -58,6 +59,9 @@ class RunRequest:
     """Segments at once; none: from the number of cores"""
     cores: int | None = None
     """To keep busy; none: all. The results do not depend on it where `jobs` is set"""
+    memory_gb: float = 2.0
+    """Of each job, for pictures and layers of the backdrop, 10^9 bytes; what does not fit is read or made again each
+    time. No result depends on it"""
 
     def __post_init__(self) -> None:
         choices_of = {"preset": PRESETS, "quality": QUALITIES, "stop_after": STAGES, "device": get_args(Device)}
@@ -70,12 +74,19 @@ class RunRequest:
         for name in ("jobs", "cores"):
             if (count := getattr(self, name)) is not None and count < 1:
                 raise ValueError(f"{name} must be at least 1, but is {count}")
+        check_memory(self.memory_gb)
         parse_range(self.frames)
 
     @property
     def instants(self) -> tuple[int, int | None]:
         """The range of `frames`."""
         return parse_range(self.frames)
+
+
+def check_memory(gigabytes: float) -> None:
+    """Raises ValueError for less than nothing, or what is no number."""
+    if not 0 <= gigabytes < math.inf:
+        raise ValueError(f"memory_gb must be 0 or more, 10^9 bytes, but is {gigabytes}")
 
 
 def parse_range(text: str) -> tuple[int, int | None]:

@@ -65,7 +65,8 @@ def halved(shot: Shot) -> Shot:
     size = camera.width, camera.height
 
     def target() -> np.ndarray:
-        return np.stack([cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in shot.target])
+        small = cv2.resize(shot.target.transpose(1, 2, 0), size, interpolation=cv2.INTER_AREA)
+        return np.ascontiguousarray(small.transpose(2, 0, 1))
 
     def known() -> np.ndarray:
         mask = shot.certain

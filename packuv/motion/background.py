@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 
+from packuv.budget import Budget
 from packuv.files import save_npz
 from packuv.footage import Views
 from packuv.progress import Progress, no_progress
@@ -68,10 +70,37 @@ def save_stills(path: Path, stills: Sequence[Still]) -> None:
     save_npz(path, {"cameras": np.array([still.camera for still in stills], np.int64), **arrays})
 
 
-def load_stills(path: Path) -> list[Still]:
-    """What `save_stills` wrote."""
-    with np.load(path) as data:
-        return [Still(int(c), data[f"pixels_{c}"], data[f"known_{c}"]) for c in data["cameras"]]
+def load_stills(path: Path, budget: Budget | None = None) -> Stills:
+    """What `save_stills` wrote. Those that the budget has no room for are read when they are asked for; None: all are
+    kept."""
+    return Stills(path, budget)
+
+
+class Stills(Sequence[Still]):
+    """Backgrounds in a file."""
+
+    def __init__(self, path: Path, budget: Budget | None) -> None:
+        self._data, self._budget = np.load(path), budget
+        self._cameras = [int(camera) for camera in self._data["cameras"]]
+        self._kept: dict[int, Still] = {}
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    @overload
+    def __getitem__(self, index: int) -> Still: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Still]: ...
+    def __getitem__(self, index: int | slice) -> Still | list[Still]:
+        if isinstance(index, slice):
+            return [self[place] for place in range(len(self))[index]]
+        camera = self._cameras[index]
+        if camera in self._kept:
+            return self._kept[camera]
+        still = Still(camera, self._data[f"pixels_{camera}"], self._data[f"known_{camera}"])
+        if self._budget is None or self._budget.take(still.pixels.nbytes + still.known.nbytes):
+            self._kept[camera] = still
+        return still
 
 
 def _still(camera: int, pictures: np.ndarray, options: BackgroundOptions) -> Still:

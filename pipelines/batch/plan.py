@@ -28,7 +28,7 @@ from tasks.artefacts.stage import Stage
 
 SHORT = 16
 """Hex digits of each part of a fingerprint"""
-OF_THE_MACHINE = ("out", "cores")
+OF_THE_MACHINE = ("out", "cores", "memory_gb")
 """Fields of a request that change no result"""
 
 

@@ -38,6 +38,8 @@ class BatchRequest:
     """Same seed, same bytes"""
     jobs: int = 1
     """Segments of a sequence at once"""
+    memory_gb: float = 2.0
+    """Of each job, for pictures and layers of the backdrop, 10^9 bytes; no result depends on it"""
     at_once: int | None = None
     """Sequences at a time, which share the cores evenly; none: from cores and memory"""
     stop_after: LastStage = "report"
@@ -66,6 +68,7 @@ class BatchRequest:
             device=self.device,
             seed=self.seed,
             jobs=self.jobs,
+            memory_gb=self.memory_gb,
         )
 
     @property

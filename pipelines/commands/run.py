@@ -51,7 +51,7 @@ def request_from(arguments: argparse.Namespace) -> RunRequest:
 
 def asked_for(arguments: argparse.Namespace) -> dict[str, Any]:
     """How to process, be it one sequence or many: fields that both requests have."""
-    named = {name: getattr(arguments, name) for name in ("preset", "quality", "frames", "device", "seed")}
+    named = {name: getattr(arguments, name) for name in ("preset", "quality", "frames", "device", "seed", "memory_gb")}
     return {**named, "settings": read_settings(arguments.config, arguments.set)}
 
 

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from packuv.budget import USUAL_BYTES
 from packuv.progress import Progress, no_progress
 from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import peak_memory_bytes
@@ -80,9 +81,11 @@ class Done:
 class Jobs:
     """Starts jobs and can end them all; safe to use from several threads."""
 
-    def __init__(self, *, threads: int) -> None:
+    def __init__(self, *, threads: int, memory_bytes: int = USUAL_BYTES) -> None:
         self.threads = threads
         """Threads that each job may use"""
+        self.memory_bytes = memory_bytes
+        """For what each job could make again, see `packuv.budget`"""
         self._running: set[subprocess.Popen[bytes]] = set()
         self._lock = threading.Lock()
         self._cancelled = ""

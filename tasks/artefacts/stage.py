@@ -21,6 +21,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from packuv.budget import USUAL_BYTES
 from packuv.progress import Progress
 from tasks.artefacts.store import Key, Store
 
@@ -44,6 +45,8 @@ class Site:
     capture: Path
     threads: int
     """That a job may use"""
+    memory_bytes: int = USUAL_BYTES
+    """For what a job could make again: pictures, layers, maps. No result depends on it"""
 
     def path(self, key: Key) -> Path:
         """Folder of a complete artefact; raises FileNotFoundError where there is none."""

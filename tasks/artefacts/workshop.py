@@ -52,7 +52,7 @@ class Workshop:
     @property
     def site(self) -> Site:
         """What jobs are told of it."""
-        return Site(self.store.root, self.capture.folder, self.jobs.threads)
+        return Site(self.store.root, self.capture.folder, self.jobs.threads, self.jobs.memory_bytes)
 
     def files(self, paths: Mapping[str, Path], label: str) -> Files:
         """Raw files by name, with their digests; no stage is made any more once one of them is another.

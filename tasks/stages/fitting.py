@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from calibration.triangulate import SparsePoints
+from packuv.budget import Budget
 from packuv.files import save_json
 from packuv.fit.frames import fit_segment
 from packuv.fit.keyframe import KeyState, enough_stands_still, fit_backdrop, fit_first, fit_next
@@ -112,9 +113,10 @@ class FitBackdrop(Stage):
         return "fit backdrop"
 
     def build(self, work: Work) -> Notes:
+        views = Footage(self.take, work.site).open_views(spill=work.scratch)
         state = fit_backdrop(
-            Footage(self.take, work.site).open_views(),
-            _stills(work, self.background),
+            views,
+            _stills(work, self.background, views.budget),
             points=_points(work, self.take),
             options=self.options,
             progress=work.progress,
@@ -138,7 +140,7 @@ class FitFirst(Stage):
 
     def build(self, work: Work) -> Notes:
         state = fit_first(
-            Footage(self.take, work.site).open_views(),
+            Footage(self.take, work.site).open_views(spill=work.scratch),
             self.instant,
             points=_points(work, self.take),
             options=self.options,
@@ -171,11 +173,12 @@ class FitNext(Stage):
         before = KeyState.load(work.path(self.previous))
         if self.end:
             before = tail(before, Segment.load(work.path(self.end) / SEGMENT))
+        views = Footage(self.take, work.site).open_views(spill=work.scratch)
         state = fit_next(
             before,
-            Footage(self.take, work.site).open_views(),
+            views,
             self.instant,
-            stills=_stills(work, self.background),
+            stills=_stills(work, self.background, views.budget),
             motion=self.motion,
             options=self.options,
             progress=work.progress,
@@ -205,7 +208,7 @@ class FitSegment(Stage):
     def build(self, work: Work) -> Notes:
         segment, figures = fit_segment(
             KeyState.load(work.path(self.key)),
-            Footage(self.take, work.site).open_views(),
+            Footage(self.take, work.site).open_views(spill=work.scratch),
             range(*self.span),
             motion=MotionCache.load(work.path(self.motion) / MOTION),
             options=self.options,
@@ -311,8 +314,8 @@ def _refusal(plate: Plate) -> str:
     )
 
 
-def _stills(work: Work, background: Key | None) -> list[Still]:
-    return load_stills(work.path(background) / STILLS) if background else []
+def _stills(work: Work, background: Key | None, budget: Budget) -> Sequence[Still]:
+    return load_stills(work.path(background) / STILLS, budget) if background else []
 
 
 def _points(work: Work, take: Take) -> Points | None:

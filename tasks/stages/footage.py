@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.rig import Camera, Rig
+from packuv.budget import Budget
 from packuv.camera import PinholeCamera
 from packuv.footage import FrameReader, LensCamera, Light, Transfer, Views, looks_like_log
 from sync.align import FrameGroups
@@ -83,8 +84,11 @@ class Footage:
         assert self.take.rig is not None, "this take is looked at as filmed"
         return Rig.load(self.site.path(self.take.rig) / RIG).select(self.take.cameras)
 
-    def open_views(self, cameras: Sequence[str] | None = None) -> Views:
-        """Undistorted pictures as filmed, and the responses, of `cameras`, by default all of this take."""
+    def open_views(self, cameras: Sequence[str] | None = None, *, spill: Path | None = None) -> Views:
+        """Undistorted pictures as filmed, and the responses, of `cameras`, by default all of this take.
+
+        What is read again and does not fit into memory goes to the folder `spill`, if given.
+        """
         names = self.take.cameras if cameras is None else tuple(cameras)
         groups, rig = self.load_groups(), self.load_rig()
         columns = [groups.cameras.index(name) for name in names]
@@ -99,6 +103,8 @@ class Footage:
             max_width=pictures.max_width,
             transfer=pictures.transfer,
             light=light.of(names, len(frames)) if light else None,
+            budget=Budget(self.site.memory_bytes),
+            spill=spill,
         )
 
     def load_light(self) -> Light | None:
