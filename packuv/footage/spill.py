@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import weakref
 from collections.abc import Hashable
 from pathlib import Path
 
@@ -14,7 +15,9 @@ class Spill:
     """Pictures, uint8, by key, on disk. Serves one thread at a time."""
 
     def __init__(self, folder: Path) -> None:
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # open as long as the pictures are wanted
+        self._file, name = tempfile.mkstemp(dir=folder)
+        os.unlink(name)
+        weakref.finalize(self, os.close, self._file)
         self._places: dict[Hashable, tuple[int, tuple[int, ...]]] = {}
         self._end = 0
 
@@ -28,7 +31,7 @@ class Spill:
         memory = np.ascontiguousarray(pixels).reshape(-1).data
         at = self._end
         while memory:
-            done = os.pwrite(self._file.fileno(), memory, at)
+            done = os.pwrite(self._file, memory, at)
             memory, at = memory[done:], at + done
         self._places[key] = self._end, pixels.shape
         self._end = at
@@ -39,7 +42,7 @@ class Spill:
         pixels = np.empty(shape, np.uint8)
         memory = pixels.reshape(-1).data
         while memory:
-            done = os.preadv(self._file.fileno(), [memory], place)
+            done = os.preadv(self._file, [memory], place)
             if not done:
                 raise OSError("the file of pictures that did not fit into memory ends before its time")
             memory, place = memory[done:], place + done
@@ -48,5 +51,5 @@ class Spill:
     def clear(self) -> None:
         """Forget all of them."""
         self._places.clear()
-        self._file.truncate(0)
+        os.truncate(self._file, 0)
         self._end = 0

@@ -94,9 +94,11 @@ def _shown(lists: Lists, used_end: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     lengths, shown = np.diff(lists.start), used_end - lists.start[:-1]
     places = np.arange(len(lists.pairs)) - np.repeat(lists.start[:-1], lengths)
     pairs = lists.pairs[places < np.repeat(shown, lengths)]
-    rows, pairs[:, GAUSSIAN] = np.unique(pairs[:, GAUSSIAN], return_inverse=True)
+    used = np.zeros(len(lists.record), bool)
+    used[pairs[:, GAUSSIAN]] = True
+    pairs[:, GAUSSIAN] = (np.cumsum(used, dtype=np.uint32) - 1)[pairs[:, GAUSSIAN]]
     pairs[:, SLOT] = 0
-    return lists.record[rows], pairs, _bounds(shown)
+    return lists.record[used], pairs, _bounds(shown)
 
 
 def _bounds(counts: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import av
 import numpy as np
 import pytest
 
+from packuv.budget import Budget
 from packuv.fit.density import DensityOptions
 from packuv.fit.frames import fit_segment
 from packuv.fit.keyframe import DEAD_CODE, KeyState, fit_backdrop, fit_first, fit_next, needed_degree
@@ -18,7 +19,7 @@ from packuv.footage import LensCamera, Views
 from packuv.gaussians.codes import OPACITY
 from packuv.gaussians.floats import ATTRIBUTES
 from packuv.metrics import psnr
-from packuv.motion import MotionCache, MotionOptions, find_background, measure_motion
+from packuv.motion import MotionCache, MotionOptions, find_background, load_stills, measure_motion, save_stills
 from packuv.motion.step import difference
 from packuv.raster import RasterOptions, render
 
@@ -252,6 +253,33 @@ def test_view_dependence_that_a_scene_shows_is_kept(views):
     plain = [Shot(c, render(base, c, options=RasterOptions(0.1)).colour) for c in views.cameras]
     dull = dataclasses.replace(shiny, sh=np.concatenate([base.sh, np.zeros((len(base), 3, 3), np.float32)], axis=1))
     assert needed_degree(dull, plain, near=0.1, options=options) == 0
+
+
+# -- memory -----------------------------------------------------------------------------------------------------------
+
+
+def test_no_result_depends_on_the_memory_that_a_fit_may_take(views, stills, motion, tmp_path):
+    save_stills(tmp_path / "stills.npz", stills)
+
+    def chain(total_bytes: int) -> tuple:
+        """Codes of a keyframe over the backdrop, and of its segment, with the budgets of their jobs."""
+        folder, budgets = _made(tmp_path / str(total_bytes)), [Budget(total_bytes) for _ in range(3)]
+        sights = [Views(views._videos, views.frames, views.lenses, budget=b, spill=folder) for b in budgets]
+        own = [load_stills(tmp_path / "stills.npz", budget) for budget in budgets]
+        still = fit_backdrop(sights[0], own[0], points=None, options=OPTIONS)
+        key = fit_next(still, sights[1], 0, stills=own[1], motion=MOTION, options=OPTIONS)
+        spans = {"motion": motion, "options": OPTIONS, "scratch": folder}
+        segment, _ = fit_segment(key, sights[2], range(FRAMES), **spans)
+        arrays = segment.key.xyz, segment.key.attributes, segment.xyz, segment.attributes
+        return key.gaussians, [array.tobytes() for array in arrays], budgets
+
+    picture = views.pixels(0, 0).nbytes
+    (plenty, codes, rich), *poor = [chain(size) for size in (10**9, 3 * picture, 0)]
+    for gaussians, again, budgets in poor:
+        assert same(gaussians, plenty)
+        assert again == codes
+        assert all(0 <= budget.free_bytes <= budget.total_bytes for budget in budgets)
+    assert all(budget.free_bytes < budget.total_bytes for budget in rich)
 
 
 # -- borders between segments ------------------------------------------------------------------------------------------

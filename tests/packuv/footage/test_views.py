@@ -196,6 +196,23 @@ def test_the_cache_keeps_within_its_bytes_and_changes_nothing(video: Path) -> No
         assert taken == sum(p.nbytes for p in small._cache.values()) <= small.budget.total_bytes
 
 
+def test_what_does_not_fit_into_memory_is_read_from_disk_instead_of_decoded_again(video: Path, tmp_path: Path) -> None:
+    frames, one = np.arange(COUNT)[:, None], WIDTH * HEIGHT * 3
+    for total in (0, 2 * one):
+        views = Views({"a": video}, frames, [LensCamera(camera())], budget=Budget(total), spill=tmp_path)
+        for instant in range(4):
+            views.pixels(0, instant)
+        views.reader.close()
+        views.reader = FrameReader({"a": tmp_path / "gone.mkv"})
+        for instant in (3, 0, 2, 1, 0, 3):
+            assert np.array_equal(views.pixels(0, instant), numbered()[instant])
+        views.forget()
+        assert views.budget.free_bytes == total
+        with pytest.raises(FileNotFoundError):
+            views.pixels(0, 0)
+    assert not list(tmp_path.iterdir())  # the files have no names
+
+
 def test_steady_pictures_undo_the_light_of_the_instant(video: Path) -> None:
     frames = np.array([[3], [4]])
     light = np.zeros((2, 1, 3))
