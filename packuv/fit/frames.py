@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,8 @@ def fit_segment(
     """
     if instants.start != key.instant:
         raise ValueError(f"a segment starts at its keyframe, instant {key.instant}, not at {instants.start}")
+    if key.still_bands:
+        options = replace(options, rates=replace(options.rates, sh_rest=0.0))
     track, backdrop = Track.resume(key, options, scratch), key.open_backdrop(options.device, views.budget)
     ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
     for instant in instants[1 + len(track.frames) :]:

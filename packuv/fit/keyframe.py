@@ -26,7 +26,7 @@ from packuv.budget import Budget
 from packuv.each import Each, as_bits, packed
 from packuv.files import save_json, save_npz
 from packuv.fit.backdrop import Backdrop, joined
-from packuv.fit.losses import photometric_loss
+from packuv.fit.bands import Judgement, drop_bands, judge, left_out, still_bands
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
 from packuv.fit.shots import Shot, find_shots, halved, moving_rows
@@ -42,10 +42,11 @@ from packuv.gaussians.floats import ATTRIBUTES, Gaussians, rows_of, with_canonic
 from packuv.motion import Still
 from packuv.motion.step import MotionOptions, changed_between, difference
 from packuv.progress import Progress, Ticks, no_progress
-from packuv.raster import Arena, RasterOptions, render
 
 LEAST_KNOWN = 0.5
 """Share of the pictures that must be known to stand still for a backdrop"""
+FOREGROUND_GAIN = 0.01
+"""Share of the loss that the bands of a keyframe's own Gaussians must gain; without, they cost nothing in the file"""
 DEAD_CODE = 1
 """Opacity codes up to this one decode below 1/255, which no renderer draws"""
 
@@ -69,6 +70,11 @@ class KeyState:
     def foreground(self) -> Gaussians:
         """Rows after those of the backdrop"""
         return rows_of(self.gaussians, slice(self.backdrop, None))
+
+    @property
+    def still_bands(self) -> bool:
+        """Whether rows after the backdrop's have no view dependence though the table has room for it."""
+        return self.quantizer.sh_degree > 0 and self.figures.get("sh", {}).get("degree") == 0
 
     @property
     def usual_loss(self) -> float:
@@ -152,21 +158,30 @@ def _fit_all(
     solver = Solver(model, bounds, options, rng)
     total, grow_from = options.iterations, options.start.count
     ticks = Ticks(progress, total)
+    judges = left_out(cameras) if options.sh_degree else []
     coarse, floating = round(total * options.coarse_share), round(total * options.float_share)
-    solver.run([halved(shot) for shot in shots], coarse, of=total, grow_from=grow_from, ticks=ticks)
+    small = [halved(shot) for index, shot in enumerate(shots) if index not in judges]
+    solver.run(small, coarse, of=total, grow_from=grow_from, ticks=ticks)
     if shell is not None:
         depths = (shell.depths(camera, index, bounds.near) for index, camera in enumerate(cameras))
         shots = [replace(shot, depths=known) for shot, known in zip(shots, depths, strict=True)]
         del shell
-    solver.run(shots, floating - solver.done, of=total, grow_from=grow_from, ticks=ticks)
+    part = [shot for index, shot in enumerate(shots) if index not in judges]
+    solver.run(part, floating - solver.done, of=total, grow_from=grow_from, ticks=ticks)
+    judgement = None
+    if options.sh_degree:
+        degrees = range(options.sh_degree + 1)
+        judgement, best = judge(solver, shots, judges, degrees, drop_bands, of=total, gain=options.sh_gain,
+                                options=options.photometric)  # fmt: skip
+        solver.merge(best)
+        del best
     solver.keep(solver.worth_keeping())
     model.gaussians = with_canonical_axes(model.gaussians)
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
-    degree = needed_degree(model.gaussians, shots, near=bounds.near, options=options)
-    model.limit_sh(degree)
-    solver.fix(choose_quantizer(model.gaussians, bounds, degree))
+    solver.fix(choose_quantizer(model.gaussians, bounds, 0 if judgement is None else judgement.degree))
     losses = solver.run(shots, total - floating, of=total, ticks=ticks)
-    return KeyState(instant, model.gaussians, 0, solver.known_quantizer, bounds, _figures(started, losses, solver))
+    figures = _figures(started, losses, solver) | ({} if judgement is None else {"sh": judgement.to_json()})
+    return KeyState(instant, model.gaussians, 0, solver.known_quantizer, bounds, figures)
 
 
 def fit_next(
@@ -209,11 +224,27 @@ def fit_next(
     if not solver.rows.any():  # nothing that enough cameras see
         figures = _figures(started, {}, solver)
         return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
-    losses = solver.run(shots, options.key_iterations, of=options.key_iterations, grow_from=len(model),
-                      ticks=Ticks(progress, options.key_iterations))  # fmt: skip
+    ticks, judgement, born_from = Ticks(progress, options.key_iterations), None, len(model)
+    if quantizer.sh_degree:
+        judgement = _judge_foreground(solver, shots, quantizer.sh_degree, options, ticks)
+    count = options.key_iterations
+    losses = solver.run(shots, count - solver.done, of=count, grow_from=born_from, ticks=ticks)
     solver.keep(~solver.rows | solver.worth_keeping())
-    figures = _figures(started, losses, solver)
+    figures = _figures(started, losses, solver) | ({} if judgement is None else {"sh": judgement.to_json()})
     return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
+
+
+def _judge_foreground(
+    solver: Solver, shots: Sequence[Shot], degree: int, options: NextOptions, ticks: Ticks
+) -> Judgement:
+    """Spend half of the iterations to find out whether what may change needs the bands that the backdrop has."""
+    judges, count = left_out([shot.camera for shot in shots]), options.key_iterations
+    part = [shot for index, shot in enumerate(shots) if index not in judges]
+    solver.run(part, count // 2, of=count, grow_from=len(solver.model), ticks=ticks)
+    judgement, best = judge(solver, shots, judges, (0, degree), still_bands, of=count, gain=FOREGROUND_GAIN,
+                            options=options.photometric)  # fmt: skip
+    solver.merge(best)
+    return judgement
 
 
 def _whole(previous: KeyState, model: Model) -> Gaussians:
@@ -289,25 +320,6 @@ def _surface(shell: Shell | None, points: Points | None, options: FirstOptions) 
         parts.append(shell.cover(round(start.count * start.shell_share)))
     parts = parts or [no_points()]
     return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
-
-
-def needed_degree(gaussians: Gaussians, shots: Sequence[Shot], *, near: float, options: FirstOptions) -> int:
-    """The lowest SH degree whose pictures are nearly as good as those of all bands: view dependence that a scene does
-    not show is not carried. Nothing is fitted again, so a band that helps is kept rather than lost."""
-    full, arena, raster = options.sh_degree, Arena(), RasterOptions(near, device=options.device)
-
-    def loss(degree: int) -> float:
-        cut = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
-        values = []
-        for shot in map(Shot.opened, shots):
-            picture = shot.response.shown(render(cut, shot.camera, options=raster, arena=arena).colour)
-            values.append(photometric_loss(picture, shot.wanted(picture), options=options.photometric).value)
-        return float(np.mean(values))
-
-    if not full:
-        return 0
-    enough = loss(full) * (1 + options.sh_gain)
-    return next(degree for degree in range(full + 1) if degree == full or loss(degree) <= enough)
 
 
 def choose_quantizer(gaussians: Gaussians, bounds: Bounds, sh_degree: int) -> Quantizer:

@@ -77,9 +77,11 @@ class FirstOptions(KeyframeOptions):
     float_share: float = 0.7
     """Share of the first fit's iterations before the quantizer is fixed"""
     sh_degree: int = 0
-    """View dependence at most: 0 none, 1 to 3 as in 3D Gaussian Splatting; bands that gain nothing are dropped"""
-    sh_gain: float = 0.01
-    """Share of the loss that the bands above a degree must gain to be carried"""
+    """View dependence at most: 0 none, 1 to 3 as in 3D Gaussian Splatting; bands that gain nothing on cameras left out
+    are dropped, see `packuv.fit.bands`"""
+    sh_gain: float = 0.03
+    """Share of the loss that the bands above a degree must gain to be carried. A matte simulated room gains 1.5 % by
+    them, 0.07 dB: they are texture then, not shine"""
     near_share: float = 0.2
     """Near plane, in scene radii; cameras may sit in the wall they film"""
     backdrop_share: float = 0.88

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -88,6 +90,33 @@ class Solver:
     def guarded(self) -> int:
         """Times that a Gaussian lost a step because its values or gradients were not finite."""
         return self._guard.count + self._overflown
+
+    def branch(self) -> Solver:
+        """Another one in the same state, which goes on by itself."""
+        twin = copy.copy(self)
+        twin.model, twin.gradient, twin._rng = copy.deepcopy((self.model, self.gradient, self._rng))
+        twin.rows, twin._order, twin._drawn = self.rows.copy(), [], None
+        twin._guard, twin._arena = Guard(twin.model, self.bounds), Arena()
+        return twin
+
+    def merge(self, twin: Solver) -> None:
+        """Go on with the Gaussians of a branch, and by its options."""
+        self.model.gaussians, self.model.moments = twin.model.gaussians, twin.model.moments
+        self._options, self._drawn = twin._options, None
+        self._guard.renew(self.model)
+
+    def hold_bands(self) -> None:
+        """Rows that may change lose their view dependence, and get none."""
+        self.model.gaussians.sh[self.rows, 1:] = 0
+        self._options = replace(self._options, rates=replace(self._options.rates, sh_rest=0.0))
+        self._drawn = None
+
+    def shown(self, shot: Shot) -> np.ndarray:
+        """What the camera makes of the Gaussians, float32 [3, H, W]."""
+        raster = RasterOptions(self.bounds.near, device=self._options.device)
+        layer = self.backdrop.layer(shot.camera, shot.tiles)
+        given: dict[str, Any] = {"options": raster, "tiles": shot.tiles, "arena": self._arena, "over": layer}
+        return shot.response.shown(render(self._decoded(), shot.camera, **given).colour)
 
     def fix(self, quantizer: Quantizer) -> None:
         """From now on render what the codes decode to."""

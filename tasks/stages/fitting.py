@@ -14,6 +14,7 @@ import numpy as np
 from calibration.triangulate import SparsePoints
 from packuv.budget import Budget
 from packuv.files import save_json
+from packuv.fit.bands import told
 from packuv.fit.frames import fit_segment
 from packuv.fit.keyframe import KeyState, enough_stands_still, fit_backdrop, fit_first, fit_next
 from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
@@ -124,6 +125,9 @@ class FitBackdrop(Stage):
         state.save(work.out)
         return dict(state.figures)
 
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        yield from _spared_bands(notes)
+
 
 @dataclass(frozen=True, kw_only=True)
 class FitFirst(Stage):
@@ -148,6 +152,9 @@ class FitFirst(Stage):
         )
         state.save(work.out)
         return dict(state.figures)
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        yield from _spared_bands(notes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,6 +302,12 @@ def read_losses(folder: Path) -> list[float]:
     """Loss of each frame after a segment's keyframe, NaN where nothing moved."""
     frames = json.loads((folder / FIGURES).read_text())["frames"]
     return [frame.get("loss", math.nan) for frame in frames]
+
+
+def _spared_bands(notes: Notes) -> Iterator[tuple[str, str]]:
+    """View dependence that was asked for and is not carried, and on what evidence."""
+    if "sh" in notes and notes["sh"]["degree"] < notes["sh"]["asked"]:
+        yield "view dependence", told(notes["sh"])
 
 
 def _plate_facts(plate: Plate) -> dict[str, Any]:

@@ -10,10 +10,9 @@ import pytest
 from packuv.budget import Budget
 from packuv.fit.density import DensityOptions
 from packuv.fit.frames import fit_segment
-from packuv.fit.keyframe import DEAD_CODE, KeyState, fit_backdrop, fit_first, fit_next, needed_degree
+from packuv.fit.keyframe import DEAD_CODE, KeyState, fit_backdrop, fit_first, fit_next
 from packuv.fit.options import FitOptions
 from packuv.fit.seam import seam, tail
-from packuv.fit.shots import Shot
 from packuv.fit.start.first import StartOptions, round_gaussians
 from packuv.footage import LensCamera, Views
 from packuv.gaussians.codes import OPACITY
@@ -235,24 +234,6 @@ def test_a_backdrop_needs_two_cameras(views, stills):
 def _made(folder):
     folder.mkdir()
     return folder
-
-
-def test_view_dependence_that_a_scene_lacks_is_not_carried(views):
-    fitted = fit_first(views, 0, points=None, options=dataclasses.replace(OPTIONS, sh_degree=2, iterations=60))
-    # The truth has none; with bands up to degree 2 a fit finds next to nothing for them.
-    assert fitted.quantizer.sh_degree < 2
-    assert fitted.gaussians.sh.shape[1] == (fitted.quantizer.sh_degree + 1) ** 2
-
-
-def test_view_dependence_that_a_scene_shows_is_kept(views):
-    options = FitOptions(sh_degree=1)
-    base = truth(0)
-    shiny = dataclasses.replace(base, sh=np.concatenate([base.sh, np.full((len(base), 3, 3), 0.3, np.float32)], axis=1))
-    shots = [Shot(c, render(shiny, c, options=RasterOptions(0.1)).colour) for c in views.cameras]
-    assert needed_degree(shiny, shots, near=0.1, options=options) == 1
-    plain = [Shot(c, render(base, c, options=RasterOptions(0.1)).colour) for c in views.cameras]
-    dull = dataclasses.replace(shiny, sh=np.concatenate([base.sh, np.zeros((len(base), 3, 3), np.float32)], axis=1))
-    assert needed_degree(dull, plain, near=0.1, options=options) == 0
 
 
 # -- memory -----------------------------------------------------------------------------------------------------------
