@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numba import prange
 
@@ -164,9 +165,7 @@ def active_tiles(
 
 def summed_area(mask: np.ndarray) -> np.ndarray:
     """int32 [H + 1, W + 1]: number of true pixels above and left of each corner."""
-    table = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), dtype=np.int32)
-    np.cumsum(np.cumsum(mask, axis=0, dtype=np.int32), axis=1, dtype=np.int32, out=table[1:, 1:])
-    return table
+    return np.asarray(cv2.integral(np.ascontiguousarray(mask).view(np.uint8), sdepth=cv2.CV_32S))
 
 
 def _check_picture(picture: np.ndarray, camera: PinholeCamera, name: str) -> np.ndarray:
