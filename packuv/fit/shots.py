@@ -18,7 +18,6 @@ from packuv.footage import Response, Views
 from packuv.footage.response import PLAIN
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import Gaussians
-from packuv.raster.view import TILE
 
 Later = Callable[[], np.ndarray]
 """Reads an array when it is needed: of many cameras one at a time is whole in memory"""
@@ -39,16 +38,6 @@ class Shot:
     """bool [H, W] where the picture counts within these tiles; None: everywhere"""
     depths: SparseDepth | None = None
     """Where the surface is known to be"""
-
-    @property
-    def pieces(self) -> np.ndarray | None:
-        """Runs of its tiles: rectangles of pixels y0, y1, x0, x1, half-open, int64 [n, 4]; None: everywhere."""
-        if self.tiles is None:
-            return None
-        edges = np.diff(np.pad(self.tiles, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-        (rows, first), (_, end) = np.nonzero(edges == 1), np.nonzero(edges == -1)
-        right, bottom = np.minimum(TILE * end, self.camera.width), np.minimum(TILE * (rows + 1), self.camera.height)
-        return np.stack([TILE * rows, bottom, TILE * first, right], axis=1)
 
     @property
     def target(self) -> np.ndarray:

@@ -238,13 +238,12 @@ class Solver:
         moving = self.rows & (rendering.visible > 0)
         behind = self._behind(shot.target) if opaque else None
         colour = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
-        pieces = shot.pieces if options.device == "cpu" else None  # a GPU reads gradients everywhere
-        picture = shot.response.shown(colour, pieces)
+        picture = shot.response.shown(colour)
         found = pulls(
             Seen(rendering, picture, shot.wanted(picture), shot, self.model.gaussians, moving, self.bounds.radius),
             options,
         )
-        drawn = self._carried_back(rendering, found, shot.response, behind, pieces)
+        drawn = self._carried_back(rendering, found, shot.response, behind)
         self.gradient.add(drawn.means2d, rendering.visible, shot.camera.width, shot.camera.height)
         values = {name: getattr(drawn, name) for name in ATTRIBUTES}
         for pull in found.values():
@@ -257,18 +256,12 @@ class Solver:
         return {name: pull.value for name, pull in found.items()}
 
     def _carried_back(
-        self,
-        rendering: Rendering,
-        found: Mapping[str, Pull],
-        response: Response,
-        behind: np.ndarray | None,
-        pieces: np.ndarray | None,
+        self, rendering: Rendering, found: Mapping[str, Pull], response: Response, behind: np.ndarray | None
     ) -> Gradients:
-        """Derivatives by the Gaussians of what pulls at what is shown, before the colour `behind` them, in pieces of
-        the picture."""
+        """Derivatives by the Gaussians of what pulls at what is shown, before the colour `behind` them."""
         d_shown = summed(pull.colour for pull in found.values())
         d_depth, d_alpha = (summed(getattr(pull, name) for pull in found.values()) for name in ("depth", "alpha"))
-        d_colour = np.zeros_like(rendering.colour) if d_shown is None else response.carried(d_shown, pieces)
+        d_colour = np.zeros_like(rendering.colour) if d_shown is None else response.carried(d_shown)
         if behind is not None:
             through = (d_colour * behind).sum(axis=0)
             d_alpha = (np.zeros_like(rendering.alpha) if d_alpha is None else d_alpha) - through

@@ -22,8 +22,6 @@ from packuv.kernels.compile import kernel, prefer_tbb
 
 GAMMA, OFFSET = colour.GAMMA, colour.OFFSET
 _f32 = np.float32
-_STRIP = 8
-"""Rows of pixels per piece of work"""
 
 
 @dataclass(frozen=True)
@@ -55,30 +53,26 @@ class Response:
         column, row, across, down = self.grid
         return Response(self.factors, self.falloff, (column * x, row * y, across / x, down / y))
 
-    def shown(self, picture: np.ndarray, pieces: np.ndarray | None = None) -> np.ndarray:
-        """What the camera films where the rig's colours are `picture`: float32 [3, H, W], sRGB, clipped to [0, 1].
-
-        With `pieces`, rectangles of pixels y0, y1, x0, x1, half-open, int64 [n, 4], only there; 0 elsewhere.
-        """
-        return self._applied(_show, picture, pieces)
+    def shown(self, picture: np.ndarray) -> np.ndarray:
+        """What the camera films where the rig's colours are `picture`: float32 [3, H, W], sRGB, clipped to [0, 1]."""
+        return self._applied(_show, picture)
 
     def undone(self, filmed: np.ndarray) -> np.ndarray:
         """The rig's colours of what was filmed, float32 [3, H, W] both; what was clipped is taken for its limit."""
         return self._applied(_undo, filmed)
 
-    def carried(self, gradient: np.ndarray, pieces: np.ndarray | None = None) -> np.ndarray:
+    def carried(self, gradient: np.ndarray) -> np.ndarray:
         """Derivative by the rig's colours, from that by what is shown, float32 [3, H, W] both.
 
         It passes through the limits: where both pictures are clipped there is none, and a colour beyond a limit that
-        the camera did not reach must come back. `pieces` as in `shown`.
+        the camera did not reach must come back.
         """
-        return self._applied(_carry, gradient, pieces)
+        return self._applied(_carry, gradient)
 
-    def _applied(self, how, picture: np.ndarray, pieces: np.ndarray | None = None) -> np.ndarray:
+    def _applied(self, how, picture: np.ndarray) -> np.ndarray:
         prefer_tbb()
-        out = np.empty_like(picture) if pieces is None else np.zeros(picture.shape, picture.dtype)
-        where = _strips(*picture.shape[1:]) if pieces is None else pieces
-        how(picture, np.array(self.factors, _f32), np.array((*self.falloff, *self.grid), _f32), where, out)
+        out = np.empty_like(picture)
+        how(picture, np.array(self.factors, _f32), np.array((*self.falloff, *self.grid), _f32), out)
         return out
 
 
@@ -97,12 +91,6 @@ def shading_means(pinhole: PinholeCamera) -> tuple[float, float]:
     return 1 / 3, (x * x / 5 + y * y / 5 + 2 * x * y / 9) / (x + y) ** 2
 
 
-def _strips(height: int, width: int) -> np.ndarray:
-    """The whole picture in pieces, int64 [n, 4]."""
-    starts = np.arange(0, height, _STRIP)
-    return np.stack([starts, np.minimum(starts + _STRIP, height), 0 * starts, 0 * starts + width], axis=1)
-
-
 # Kernels take the lens as float32 [6]: falloff a, b, then the grid.
 
 
@@ -119,31 +107,28 @@ def _shading(lens, x, y):
 
 
 @kernel(parallel=True)
-def _show(picture, factors, lens, pieces, out):
-    for n in prange(len(pieces)):
-        for y in range(pieces[n, 0], pieces[n, 1]):
-            for x in range(pieces[n, 2], pieces[n, 3]):
-                shading = _shading(lens, x, y)
-                for c in range(3):
-                    value = factors[c] * shading * (picture[c, y, x] + _f32(OFFSET)) - _f32(OFFSET)
-                    out[c, y, x] = min(max(value, _f32(0)), _f32(1))
+def _show(picture, factors, lens, out):
+    for y in prange(picture.shape[1]):
+        for x in range(picture.shape[2]):
+            shading = _shading(lens, x, y)
+            for c in range(3):
+                value = factors[c] * shading * (picture[c, y, x] + _f32(OFFSET)) - _f32(OFFSET)
+                out[c, y, x] = min(max(value, _f32(0)), _f32(1))
 
 
 @kernel(parallel=True)
-def _undo(filmed, factors, lens, pieces, out):
-    for n in prange(len(pieces)):
-        for y in range(pieces[n, 0], pieces[n, 1]):
-            for x in range(pieces[n, 2], pieces[n, 3]):
-                shading = _shading(lens, x, y)
-                for c in range(3):
-                    out[c, y, x] = (filmed[c, y, x] + _f32(OFFSET)) / (factors[c] * shading) - _f32(OFFSET)
+def _undo(filmed, factors, lens, out):
+    for y in prange(filmed.shape[1]):
+        for x in range(filmed.shape[2]):
+            shading = _shading(lens, x, y)
+            for c in range(3):
+                out[c, y, x] = (filmed[c, y, x] + _f32(OFFSET)) / (factors[c] * shading) - _f32(OFFSET)
 
 
 @kernel(parallel=True)
-def _carry(gradient, factors, lens, pieces, out):
-    for n in prange(len(pieces)):
-        for y in range(pieces[n, 0], pieces[n, 1]):
-            for x in range(pieces[n, 2], pieces[n, 3]):
-                shading = _shading(lens, x, y)
-                for c in range(3):
-                    out[c, y, x] = factors[c] * shading * gradient[c, y, x]
+def _carry(gradient, factors, lens, out):
+    for y in prange(gradient.shape[1]):
+        for x in range(gradient.shape[2]):
+            shading = _shading(lens, x, y)
+            for c in range(3):
+                out[c, y, x] = factors[c] * shading * gradient[c, y, x]
