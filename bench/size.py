@@ -76,7 +76,7 @@ class Case:
     """Of the backdrop, about"""
     memory_gb: float
     iterations: int
-    """Of each of the four fits, at least one for each camera"""
+    """Of the backdrop and of each frame; a keyframe has one for each camera at least, to hold what it may"""
 
 
 @dataclass(frozen=True)
@@ -154,10 +154,10 @@ def open_views(case: Case, folder: Path | None) -> Views:
 
 def options_of(case: Case) -> FitOptions:
     """Few iterations of a fit with so many Gaussians."""
-    count = max(case.iterations, case.cameras)
+    count = case.iterations
     return FitOptions(
         iterations=round(count / 0.8),  # a tenth of them is coarse
-        key_iterations=count,
+        key_iterations=max(count, case.cameras),
         frame_iterations=count,
         key_births=max(500, case.gaussians // 10),
         # All on the shell: as thin as what is fitted long, where balls that fill the room overlap ten times as much.
@@ -334,7 +334,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cameras", default="20,88", metavar="N,N")
     parser.add_argument("--gaussians", default="20000,60000", metavar="N,N", help="the last one for all sizes")
     parser.add_argument("--memory-gb", default="2", metavar="GB,GB", help="budgets, each for all cases")
-    parser.add_argument("--iterations", type=int, default=40, help="of each fit, at least one for each camera")
+    parser.add_argument("--iterations", type=int, default=40, help="of the backdrop and each frame")
     parser.add_argument("--case", help="measure this one, in this process")
     parser.add_argument("--prepare", type=Path, help="folder for what the case starts from")
     given = parser.parse_args(arguments)
