@@ -24,6 +24,9 @@ from packuv.kernels.compile import kernel, prefer_tbb
 from packuv.raster import ewa
 from packuv.raster.view import VIEW_CX, VIEW_CY, VIEW_FX, VIEW_FY, VIEW_HEIGHT, VIEW_NEAR, VIEW_WIDTH, view_constants
 
+MOST_PIXELS = 8
+"""Across a direction; pictures with more are halved before the sweep"""
+
 
 @dataclass(frozen=True)
 class ShellOptions:
@@ -186,7 +189,8 @@ def _agreed(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scene radius / distance where cameras agree best [V, U], who sees it [V, U, C], and where that is sure [V, U]."""
     prefer_tbb()
-    grey, views = _grey(cameras, pictures), np.stack([view_constants(camera, bounds.near, 0.0) for camera in cameras])
+    seen_by = [coarse(camera, options.columns) for camera in cameras]
+    grey, views = _grey(seen_by, pictures), np.stack([view_constants(camera, bounds.near, 0.0) for camera in seen_by])
     shape, count = rays.shape[:2], len(cameras)
     inverse = np.linspace(1 / options.nearest, 1 / options.farthest, options.steps)
     painted = np.empty((count, *shape), np.float32)
@@ -207,12 +211,22 @@ def _agreed(
 
 
 def _grey(cameras: Sequence[PinholeCamera], pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Brightness of pictures of any size, float32 [C, H, W], zeros where one is smaller."""
+    """Brightness of pictures at the cameras' sizes, float32 [C, H, W], zeros where one is smaller."""
     height, width = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
     grey = np.zeros((len(pictures), height, width), np.float32)
     for index, picture in enumerate(pictures):
-        grey[index, : picture.shape[1], : picture.shape[2]] = picture.mean(axis=0)
+        camera, bright = cameras[index], picture.mean(axis=0)
+        if bright.shape != (camera.height, camera.width):
+            bright = cv2.resize(bright, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        grey[index, : camera.height, : camera.width] = bright
     return grey
+
+
+def coarse(camera: PinholeCamera, columns: int) -> PinholeCamera:
+    """The camera at the size that a sphere of so many columns can use: larger pictures take memory, and alias."""
+    while camera.fx * 2 * math.pi / columns >= MOST_PIXELS:
+        camera = camera.scaled(camera.width // 2, camera.height // 2)
+    return camera
 
 
 def _colours(

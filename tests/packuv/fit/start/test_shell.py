@@ -3,7 +3,7 @@ import pytest
 
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
-from packuv.fit.start.shell import ShellOptions, directions, interpolate, sweep_shell
+from packuv.fit.start.shell import MOST_PIXELS, ShellOptions, coarse, directions, interpolate, sweep_shell
 
 RADII = np.array([5.0, 5.6, 4.7])
 """Half axes of the room in these tests: an ellipsoid about the origin"""
@@ -49,6 +49,24 @@ def test_the_rest_of_the_wall_continues_what_is_sure(room):
     assert np.median(np.abs(off)) < 0.1
     assert cover.rgb.min() >= 0
     assert cover.rgb.max() <= 1
+
+
+def test_pictures_finer_than_the_sphere_are_halved_first(room):
+    cameras, pictures = room
+    assert all(coarse(camera, OPTIONS.columns) == camera for camera in cameras)
+    scale = next(2**n for n in range(1, 9) if 2**n * cameras[0].fx * 2 * np.pi / OPTIONS.columns >= MOST_PIXELS)
+    fine = [camera.scaled(scale * camera.width, scale * camera.height) for camera in cameras]
+    assert [coarse(camera, OPTIONS.columns).width for camera in fine] == [
+        camera.width * scale // 2 for camera in cameras
+    ]
+    large = [picture.repeat(scale, axis=1).repeat(scale, axis=2) for picture in pictures]
+    half = [picture.repeat(scale // 2, axis=1).repeat(scale // 2, axis=2) for picture in pictures]
+    halved = [camera.scaled(scale * camera.width // 2, scale * camera.height // 2) for camera in cameras]
+    first, again = (sweep_shell(*given, bounds=BOUNDS, options=OPTIONS) for given in ((fine, large), (halved, half)))
+    assert first is not None
+    assert again is not None
+    assert np.array_equal(first.sure, again.sure)
+    assert np.array_equal(first.xyz, again.xyz)
 
 
 def test_sure_points_are_drawn_by_the_seed(room):
