@@ -68,5 +68,7 @@ def test_quality_sets_the_tolerance_of_the_scene_file_and_settings_win_over_it()
     assert compose("draft", CAPTURE, {}, quality="high").encode.tolerance == TOLERANCES[Quality.HIGH]
     set_by_hand = {"encode": {"tolerance": {"position": 3}}}
     assert compose("draft", CAPTURE, set_by_hand, quality="low").encode.tolerance == Tolerance(3, 4)
+    with pytest.raises(ValueError, match="memory_gb must be 0 or more, 10\\^9 bytes, but is -1"):
+        RunRequest("/capture", "/out", memory_gb=-1)
     with pytest.raises(ValueError, match="quality must be one of lossless, high, medium, low, but is 'ultra'"):
         RunRequest("capture", "out", quality="ultra")
