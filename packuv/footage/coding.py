@@ -111,8 +111,8 @@ class Coding:
     def plain(self, said: Transfer | None) -> bool:
         """Whether FFmpeg shows this as it is meant: 8 bits, finished, its matrix named, its range what it assumes.
 
-        Measured with torchcodec and FFmpeg 5.1: it reads untagged pictures as BT.601 whatever their size, passes over a full range
-        unless the format is called yuvj, and is up to 4 of 255 codes off for subsampled chroma of 10 bits.
+        Measured with torchcodec and FFmpeg 5.1: it reads untagged pictures as BT.601 whatever their size, passes over a
+        full range unless the format is called yuvj, and is up to 4 of 255 codes off for subsampled chroma of 10 bits.
         """
         curve = self.curve(said)
         if self.bits > 8 or curve is not Transfer.SDR or self.gamut(curve) != BT709:

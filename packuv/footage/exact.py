@@ -1,6 +1,4 @@
-"""Frames of a video by number, decoded by PyAV, and made pictures by FFmpeg where it shows them as they are meant, by us
-where not.
-"""
+"""Frames of a video by number, decoded by PyAV; FFmpeg converts what it shows as it is meant, we convert the rest."""
 
 from __future__ import annotations
 
