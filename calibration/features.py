@@ -6,14 +6,18 @@ finds the same features.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numba import njit
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 _LENGTH = 512.0
 """Norm of a descriptor before rounding to int16"""
 
@@ -67,6 +71,12 @@ def detect(picture: np.ndarray, *, options: FeatureOptions = FeatureOptions()) -
     order = np.lexsort((rest[:, 1], rest[:, 0], place[:, 1], place[:, 0]))  # OpenCV's threads leave no fixed order
     places = np.unique(place[order], axis=0, return_inverse=True)[1].astype(np.int32)
     return Features(place[order] + 0.5, _rooted(histograms[order]), places, rest[order, 0].astype(np.float32))
+
+
+def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """`work` on each item, in order, by as many threads as OpenCV may use: what a job is given."""
+    with ThreadPoolExecutor(max(1, cv2.getNumThreads())) as pool:
+        return list(pool.map(work, items))
 
 
 @dataclass(frozen=True)
@@ -137,7 +147,7 @@ def _open_band(first: int, second: int) -> Band:
     return Band(np.zeros((first, 3)), np.zeros((second, 3)), np.ones(first), np.ones(second))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _rivals(
     first: np.ndarray,
     second: np.ndarray,
