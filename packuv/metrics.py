@@ -39,11 +39,11 @@ def ssim(picture: np.ndarray, truth: np.ndarray) -> float:
     loss of 3D Gaussian Splatting pads with zeros instead and differs by some 1e-3. Values are clipped to [0, 1]
     first. Raises ValueError if the shapes differ or the picture is smaller than the window.
     """
-    return ssims([picture], truth)[0]
+    return likenesses([picture], truth)[0][1]
 
 
-def ssims(pictures: Sequence[np.ndarray], truth: np.ndarray) -> list[float]:
-    """`ssim` of several pictures beside one truth, whose own means and variances are computed once."""
+def likenesses(pictures: Sequence[np.ndarray], truth: np.ndarray) -> list[tuple[float, float]]:
+    """`psnr` and `ssim` of several pictures beside one truth, whose own means and variances are computed once."""
     for picture in pictures:
         _check_shapes(picture, truth)
     if truth.ndim not in (2, 3) or min(truth.shape[-2:]) < _WINDOW:
@@ -51,13 +51,15 @@ def ssims(pictures: Sequence[np.ndarray], truth: np.ndarray) -> list[float]:
             f"SSIM needs pictures [3, H, W] or [H, W] of at least {_WINDOW} pixels a side, not {truth.shape}"
         )
     planes = [picture.reshape(-1, *truth.shape[-2:]) for picture in (truth, *pictures)]
-    found = np.empty((len(pictures), len(planes[0])))
+    similar, wrong = np.empty((len(pictures), len(planes[0]))), np.empty((len(pictures), *planes[0].shape))
+    a, square, product = np.empty((3, *truth.shape[-2:]))
     for channel, (plane, *others) in enumerate(zip(*planes, strict=True)):
         b = _clipped(plane)
-        moments = _blur(b), _blur(b * b)
+        mean_b, square_b = _blur(b), _blur(b * b)
         for row, other in enumerate(others):
-            found[row, channel] = _ssim_map(_clipped(other), b, *moments).mean()
-    return [float(row.mean()) for row in found]
+            _multiply(other, b, a, square, product, wrong[row, channel])
+            similar[row, channel] = _ssim(_blur(a), mean_b, _blur(square), square_b, _blur(product))
+    return [(decibels(float(np.mean(w))), float(row.mean())) for w, row in zip(wrong, similar, strict=True)]
 
 
 def trend(frames: Sequence[int], levels: Sequence[float]) -> float | None:
@@ -82,13 +84,13 @@ def _clipped(picture: np.ndarray) -> np.ndarray:
     return clipped
 
 
-def _ssim_map(a: np.ndarray, b: np.ndarray, mean_b: np.ndarray, square_b: np.ndarray) -> np.ndarray:
-    """SSIM where the window lies inside, float64 [H - 10, W - 10]; the means are windows' of b and of its square."""
-    square, product = np.empty_like(a), np.empty_like(a)
-    _products(a, b, square, product)
-    similarity = np.empty((a.shape[0] - 2 * _EDGE, a.shape[1] - 2 * _EDGE))
-    _compare(_blur(a), mean_b, _blur(square), square_b, _blur(product), similarity)
-    return similarity
+def _ssim(
+    mean_a: np.ndarray, mean_b: np.ndarray, square_a: np.ndarray, square_b: np.ndarray, product: np.ndarray
+) -> float:
+    """Mean SSIM where the window lies inside, from means over windows, float64 [H, W] each."""
+    similarity = np.empty((mean_a.shape[0] - 2 * _EDGE, mean_a.shape[1] - 2 * _EDGE))
+    _compare(mean_a, mean_b, square_a, square_b, product, similarity)
+    return float(similarity.mean())
 
 
 def _blur(plane: np.ndarray) -> np.ndarray:
@@ -96,10 +98,14 @@ def _blur(plane: np.ndarray) -> np.ndarray:
 
 
 @kernel()
-def _products(a, b, square, product):
-    for y in range(a.shape[0]):
-        for x in range(a.shape[1]):
-            square[y, x], product[y, x] = a[y, x] * a[y, x], a[y, x] * b[y, x]
+def _multiply(picture, b, a, square, product, wrong):
+    """The picture, clipped, its square, its product with b, and the square of its difference from b."""
+    for y in range(b.shape[0]):
+        for x in range(b.shape[1]):
+            given = np.float64(picture[y, x])
+            value = 0.0 if given < 0 else 1.0 if given > 1 else given
+            a[y, x], square[y, x], product[y, x] = value, value * value, value * b[y, x]
+            wrong[y, x] = (value - b[y, x]) * (value - b[y, x])
 
 
 @kernel()

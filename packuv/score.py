@@ -21,7 +21,7 @@ from packuv.colour import GAMMA, OFFSET, linear_from_srgb, lit, srgb_from_linear
 from packuv.files import save_json
 from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
-from packuv.metrics import decibels, psnr, ssims, trend
+from packuv.metrics import decibels, likenesses, trend
 from packuv.motion import Follower, one_opencv_thread
 from packuv.progress import Progress
 from packuv.raster import Arena, RasterOptions, render
@@ -148,8 +148,9 @@ class _Judge:
         assert truth is not None
         assert filmed is not None
         pictures = shot.seen, shot.shown, with_own_gain(shot.shown, truth)
-        levels = [level if math.isfinite(level := psnr(picture, truth)) else None for picture in pictures]
-        raw, calibrated, own = zip(levels, ssims(pictures, truth), strict=True)
+        raw, calibrated, own = (
+            (level if math.isfinite(level) else None, alike) for level, alike in likenesses(pictures, truth)
+        )
         perceived = self._lpips(shot.shown, truth) if self._lpips else None
         error = shot.shown - truth
         if before:
