@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from calibration.accept import CheckOptions, MatchesReport, MatchOptions, PairMatches, check_rig, matches_report
-from calibration.features import Band, FeatureOptions, Features, detect, match
+from calibration.features import Band, FeatureOptions, Features, detect, match, side_by_side
 from calibration.multiview import Sightings, essential, locate, medians
 from calibration.rig import Camera, Rig
 from calibration.srgb import LINEAR, srgb_from_linear
@@ -138,24 +138,29 @@ def verified_matches(
     rig: Rig, features: Mapping[str, Features], pairs: Sequence[tuple[str, str]], *, ratio: float
 ) -> list[PairMatches]:
     """Matches that agree on some epipolar geometry, found without the poses: what judges them."""
-    found = []
-    for first, second in pairs:
+
+    def verified(pair: tuple[str, str]) -> PairMatches | None:
+        first, second = pair
         rows, _ = match(features[first], features[second], ratio=ratio)
         if len(rows) < 8:
-            continue
+            return None
         a, b = features[first].pixels[rows[:, 0]], features[second].pixels[rows[:, 1]]
         flat = [_undistorted(rig[name], pixels) for name, pixels in ((first, a), (second, b))]
         _, mask = cv2.findFundamentalMat(flat[0], flat[1], cv2.USAC_MAGSAC, 2.0, 0.999, 10_000)
-        if mask is not None:
-            kept = mask.ravel().astype(bool)
-            found.append(PairMatches(first, second, a[kept], b[kept]))
-    return found
+        if mask is None:
+            return None
+        kept = mask.ravel().astype(bool)
+        return PairMatches(first, second, a[kept], b[kept])
+
+    return [found for found in side_by_side(verified, pairs) if found]
 
 
 def detect_all(rig: Rig, pictures: Mapping[str, np.ndarray], *, options: FeatureOptions) -> dict[str, Features]:
     """Features of each camera's picture, in the order of the rig; raises ValueError for pictures that do not fit it."""
     _check_pictures(rig, pictures)
-    return {name: detect(pictures[name], options=options) for name in rig.names if name in pictures}
+    names = [name for name in rig.names if name in pictures]
+    found = side_by_side(lambda name: detect(pictures[name], options=options), names)
+    return dict(zip(names, found, strict=True))
 
 
 def _check_pictures(rig: Rig, pictures: Mapping[str, np.ndarray]) -> None:
@@ -218,7 +223,7 @@ def _rays(camera: Camera, features: Features) -> np.ndarray:
 def _sightings(
     rig: Rig, features: Mapping[str, Features], pairs: Sequence[tuple[str, str]], options: TriangulateOptions
 ) -> Sightings:
-    links = [_link(rig, first, second, features, options) for first, second in pairs]
+    links = side_by_side(lambda pair: _link(rig, pair[0], pair[1], features, options), pairs)
     number = {name: index for index, name in enumerate(rig.names)}
     counts = {number[name]: int(found.places.max(initial=-1)) + 1 for name, found in features.items()}
     point, camera, place = chain(links, counts, min_views=options.min_views)

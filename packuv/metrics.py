@@ -7,8 +7,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-_WINDOW = 11
+from packuv.kernels.compile import kernel
+
+_WINDOW, _EDGE = 11, 5
 _SIGMA = 1.5
+_C1, _C2 = 0.01**2, 0.03**2
 LEAST_FRAMES = 30
 """Fewer frames show no trend"""
 
@@ -18,8 +21,8 @@ def psnr(picture: np.ndarray, truth: np.ndarray) -> float:
 
     Values beyond [0, 1] are clipped first, as a display would. Raises ValueError if the shapes differ.
     """
-    a, b = _clipped(picture, truth)
-    return decibels(float(np.mean((a - b) ** 2)))
+    _check_shapes(picture, truth)
+    return decibels(float(np.mean((_clipped(picture) - _clipped(truth)) ** 2)))
 
 
 def decibels(squared_error: float) -> float:
@@ -36,11 +39,27 @@ def ssim(picture: np.ndarray, truth: np.ndarray) -> float:
     loss of 3D Gaussian Splatting pads with zeros instead and differs by some 1e-3. Values are clipped to [0, 1]
     first. Raises ValueError if the shapes differ or the picture is smaller than the window.
     """
-    a, b = _clipped(picture, truth)
-    if a.ndim not in (2, 3) or min(a.shape[-2:]) < _WINDOW:
-        raise ValueError(f"SSIM needs pictures [3, H, W] or [H, W] of at least {_WINDOW} pixels a side, not {a.shape}")
-    planes = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
-    return float(np.mean([_ssim_map(x, y).mean() for x, y in planes]))
+    return likenesses([picture], truth)[0][1]
+
+
+def likenesses(pictures: Sequence[np.ndarray], truth: np.ndarray) -> list[tuple[float, float]]:
+    """`psnr` and `ssim` of several pictures beside one truth, whose own means and variances are computed once."""
+    for picture in pictures:
+        _check_shapes(picture, truth)
+    if truth.ndim not in (2, 3) or min(truth.shape[-2:]) < _WINDOW:
+        raise ValueError(
+            f"SSIM needs pictures [3, H, W] or [H, W] of at least {_WINDOW} pixels a side, not {truth.shape}"
+        )
+    planes = [picture.reshape(-1, *truth.shape[-2:]) for picture in (truth, *pictures)]
+    similar, wrong = np.empty((len(pictures), len(planes[0]))), np.empty((len(pictures), *planes[0].shape))
+    a, square, product = np.empty((3, *truth.shape[-2:]))
+    for channel, (plane, *others) in enumerate(zip(*planes, strict=True)):
+        b = _clipped(plane)
+        mean_b, square_b = _blur(b), _blur(b * b)
+        for row, other in enumerate(others):
+            _multiply(other, b, a, square, product, wrong[row, channel])
+            similar[row, channel] = _ssim(_blur(a), mean_b, _blur(square), square_b, _blur(product))
+    return [(decibels(float(np.mean(w))), float(row.mean())) for w, row in zip(wrong, similar, strict=True)]
 
 
 def trend(frames: Sequence[int], levels: Sequence[float]) -> float | None:
@@ -55,23 +74,46 @@ def trend(frames: Sequence[int], levels: Sequence[float]) -> float | None:
     return 100 * float(at @ np.asarray(levels, np.float64) / (at @ at))
 
 
-def _clipped(picture: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _check_shapes(picture: np.ndarray, truth: np.ndarray) -> None:
     if picture.shape != truth.shape:
         raise ValueError(f"pictures to compare must have one shape, but have {picture.shape} and {truth.shape}")
-    return np.clip(picture, 0, 1).astype(np.float64), np.clip(truth, 0, 1).astype(np.float64)
 
 
-def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """SSIM where the window lies inside, float64 [H - 10, W - 10]."""
-    c1, c2 = 0.01**2, 0.03**2
-    mean_a, mean_b = _blur(a), _blur(b)
-    variance_a, variance_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
-    covariance = _blur(a * b) - mean_a * mean_b
-    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
-    similarity: np.ndarray = luminance * (2 * covariance + c2) / (variance_a + variance_b + c2)
-    return similarity
+def _clipped(picture: np.ndarray) -> np.ndarray:
+    clipped: np.ndarray = np.clip(picture, 0, 1).astype(np.float64)
+    return clipped
+
+
+def _ssim(
+    mean_a: np.ndarray, mean_b: np.ndarray, square_a: np.ndarray, square_b: np.ndarray, product: np.ndarray
+) -> float:
+    """Mean SSIM where the window lies inside, from means over windows, float64 [H, W] each."""
+    similarity = np.empty((mean_a.shape[0] - 2 * _EDGE, mean_a.shape[1] - 2 * _EDGE))
+    _compare(mean_a, mean_b, square_a, square_b, product, similarity)
+    return float(similarity.mean())
 
 
 def _blur(plane: np.ndarray) -> np.ndarray:
-    edge = _WINDOW // 2
-    return cv2.GaussianBlur(plane, (_WINDOW, _WINDOW), _SIGMA)[edge:-edge, edge:-edge]
+    return cv2.GaussianBlur(plane, (_WINDOW, _WINDOW), _SIGMA)
+
+
+@kernel()
+def _multiply(picture, b, a, square, product, wrong):
+    """The picture, clipped, its square, its product with b, and the square of its difference from b."""
+    for y in range(b.shape[0]):
+        for x in range(b.shape[1]):
+            given = np.float64(picture[y, x])
+            value = 0.0 if given < 0 else 1.0 if given > 1 else given
+            a[y, x], square[y, x], product[y, x] = value, value * value, value * b[y, x]
+            wrong[y, x] = (value - b[y, x]) * (value - b[y, x])
+
+
+@kernel()
+def _compare(mean_a, mean_b, square_a, square_b, product, out):
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            at = y + _EDGE, x + _EDGE
+            a, b = mean_a[at], mean_b[at]
+            variance_a, variance_b, covariance = square_a[at] - a * a, square_b[at] - b * b, product[at] - a * b
+            luminance = (2 * a * b + _C1) / (a * a + b * b + _C1)
+            out[y, x] = luminance * (2 * covariance + _C2) / (variance_a + variance_b + _C2)

@@ -5,7 +5,9 @@ still areas apart, motion, flicker, LPIPS. docs/scores.md defines each.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -19,8 +21,8 @@ from packuv.colour import GAMMA, OFFSET, linear_from_srgb, lit, srgb_from_linear
 from packuv.files import save_json
 from packuv.footage import Views
 from packuv.gaussians.floats import Gaussians
-from packuv.metrics import decibels, psnr, ssim, trend
-from packuv.motion import Follower
+from packuv.metrics import decibels, likenesses, trend
+from packuv.motion import Follower, one_opencv_thread
 from packuv.progress import Progress
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene
@@ -70,52 +72,95 @@ TRENDS = {"still_trend_db": "psnr_still_db", "never_moving_trend_db": "psnr_neve
 """What is said of their course, dB per 100 frames"""
 BLOCKS = 40
 """Across a picture, by which places are known through which nothing ever moves"""
+AHEAD = 2
+"""Drawn pictures that may wait for each worker"""
 
 Measure = Callable[[np.ndarray, np.ndarray], float]
 """Of a picture and its truth, float32 [3, H, W], sRGB"""
 
 
-def score(scene: Scene, views: Views, progress: Progress, *, lpips: Measure | None = None) -> list[Score]:
+def score(
+    scene: Scene, views: Views, progress: Progress, *, lpips: Measure | None = None, workers: int = 2
+) -> list[Score]:
     """Score every frame on all cameras of the views, whose instant i is frame i of the scene.
 
-    A camera without a picture at an instant is not scored there.
+    A camera without a picture at an instant is not scored there. One thread draws, `workers` others compare; the scores
+    do not depend on their number.
     """
-    artist, scores = Artist(scene), list[Score]()
-    watches = [_Watch() for _ in views.cameras]
-    last: dict[str, np.ndarray] = {}
+    artist, waiting, scores = Artist(scene), deque[Future[Score]](), list[Score]()
+    held_out = scene.header.held_out
+    judges = [_Judge(views, index, name in held_out, lpips) for index, name in enumerate(views.names)]
     gaussians = None
-    for frame in range(len(scene)):
-        gaussians = scene.gaussians(frame, into=gaussians)
-        time_ns = int(scene.header.times_ns[frame])
-        for index, camera in enumerate(views.cameras):
-            truth = views.filmed(index, frame)
-            if truth is None:
-                continue
-            drawn = artist.draw(gaussians, camera)
-            seen = np.clip(lit(drawn, scene.light(frame)), 0, 1)
-            shown = views.response(index, frame).shown(drawn)
-            error, before = shown - truth, last.get(camera.name)
-            flicker = None if before is None else float(np.abs(error - before).mean())
-            last[camera.name] = error
-            held_out = camera.name in scene.header.held_out
-            raw, calibrated, own = (_likeness(picture, truth) for picture in (seen, shown, with_own_gain(shown, truth)))
-            areas = watches[index].see(*_steady(views, index, frame, drawn, shown), error)
-            perceived = lpips(shown, truth) if lpips else None
-            scores.append(
-                Score(frame, time_ns, camera.name, held_out, *raw, *calibrated, *own, flicker, *areas, perceived)
-            )
-        progress(frame + 1, len(scene), f"{_mean([s.psnr_calibrated_db for s in scores]) or 0:.2f} dB")
-    never = {name: watch.never_moving() for name, watch in zip(views.names, watches, strict=True)}
+    with one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
+        for frame in range(len(scene)):
+            gaussians = scene.gaussians(frame, into=gaussians)
+            for index, camera in enumerate(views.cameras):
+                if views.frames[frame, index] < 0:
+                    continue
+                drawn = artist.draw(gaussians, camera)
+                shot = _Shot.of(views, index, frame, drawn, scene)
+                waiting.append(judges[index].submit(pool, shot))
+                while len(waiting) > AHEAD * workers:
+                    scores.append(waiting.popleft().result())
+            progress(frame + 1, len(scene), f"{_mean([s.psnr_calibrated_db for s in scores]) or 0:.2f} dB")
+        scores += [future.result() for future in waiting]
+    never = {judge.name: judge.watch.never_moving() for judge in judges}
     return [replace(item, psnr_never_moving_db=next(never[item.camera])) for item in scores]
 
 
-def _steady(
-    views: Views, camera: int, instant: int, drawn: np.ndarray, shown: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """What was filmed and what is rendered, uint8 [H, W, 3] both, as the camera films it in steady light."""
-    filmed = views.steady(camera, instant)
-    assert filmed is not None  # for it was scored
-    return filmed, as_pixels(shown if views.light is None else views.response(camera, None).shown(drawn))
+@dataclass(frozen=True)
+class _Shot:
+    """A drawn frame as one camera shows it."""
+
+    frame: int
+    time_ns: int
+    seen: np.ndarray
+    """float32 [3, H, W], in the scene's light of the instant"""
+    shown: np.ndarray
+    """float32 [3, H, W], as the camera films it"""
+    steady: np.ndarray
+    """uint8 [H, W, 3], as the camera films it in steady light"""
+
+    @classmethod
+    def of(cls, views: Views, camera: int, frame: int, drawn: np.ndarray, scene: Scene) -> _Shot:
+        shown = views.response(camera, frame).shown(drawn)
+        steady = shown if views.light is None else views.response(camera, None).shown(drawn)
+        seen = np.clip(lit(drawn, scene.light(frame)), 0, 1)
+        return cls(frame, int(scene.header.times_ns[frame]), seen, shown, as_pixels(steady))
+
+
+class _Judge:
+    """Compares one camera's pictures with what it filmed, in order, in other threads."""
+
+    def __init__(self, views: Views, camera: int, held_out: bool, lpips: Measure | None) -> None:
+        self.name, self.watch = views.names[camera], _Watch()
+        self._views, self._camera, self._held_out, self._lpips = views, camera, held_out, lpips
+        self._error: np.ndarray | None = None
+        self._last: Future[Score] | None = None
+
+    def submit(self, pool: ThreadPoolExecutor, shot: _Shot) -> Future[Score]:
+        """The score of the next picture, when it is there."""
+        self._last = pool.submit(self._score, shot, self._last)
+        return self._last
+
+    def _score(self, shot: _Shot, before: Future[Score] | None) -> Score:
+        truth, filmed = (look(self._camera, shot.frame) for look in (self._views.filmed, self._views.steady))
+        assert truth is not None
+        assert filmed is not None
+        pictures = shot.seen, shot.shown, with_own_gain(shot.shown, truth)
+        raw, calibrated, own = (
+            (level if math.isfinite(level) else None, alike) for level, alike in likenesses(pictures, truth)
+        )
+        perceived = self._lpips(shot.shown, truth) if self._lpips else None
+        error = shot.shown - truth
+        if before:
+            before.result()  # a pool begins in order, so this one has begun
+        flicker = None if self._error is None else float(np.abs(error - self._error).mean())
+        self._error = error
+        areas = self.watch.see(filmed, shot.steady, error)
+        return Score(
+            shot.frame, shot.time_ns, self.name, self._held_out, *raw, *calibrated, *own, flicker, *areas, perceived
+        )
 
 
 Areas = tuple[float | None, float | None, float | None, float | None]
@@ -196,15 +241,6 @@ class Artist:
         """float32 [3, H, W], in the rig's common colour and steady light; lamps are brighter than 1."""
         rendering = render(gaussians, camera, options=self._options, arena=self._arena)
         return cast(np.ndarray, rendering.colour)
-
-
-Likeness = tuple[float | None, float]
-"""PSNR in dB, None where two pictures are equal, and SSIM"""
-
-
-def _likeness(picture: np.ndarray, truth: np.ndarray) -> Likeness:
-    decibel = psnr(picture, truth)
-    return decibel if math.isfinite(decibel) else None, ssim(picture, truth)
 
 
 def with_own_gain(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:

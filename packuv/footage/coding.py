@@ -89,6 +89,15 @@ class Coding:
     def high_definition(self) -> bool:
         return self.width >= 1280 or self.height > 576
 
+    @property
+    def coarse(self) -> bool:
+        """Whether chroma is interpolated by a general scaler, whose results differ from one version to the next.
+
+        Measured on 751 videos that are `plain`: PyAV's FFmpeg 8.0 and torchcodec on FFmpeg 5.1 make the same bytes of
+        all others, of 19 formats and 7 matrices, and 1.1 to 2.2 codes apart of these.
+        """
+        return self.format.startswith(("yuv410", "yuv411", "yuv440"))
+
     def curve(self, said: Transfer | None) -> Transfer:
         """What code values mean: what was `said`, else the tag for HLG and PQ, else a finished picture."""
         return said or _TRANSFERS.get(self.transfer, Transfer.SDR)
@@ -100,10 +109,10 @@ class Coding:
         return _PRIMARIES.get(self.primaries, BT709 if curve is Transfer.SDR else BT2020)
 
     def plain(self, said: Transfer | None) -> bool:
-        """Whether torchcodec shows this as it is meant: 8 bits, finished, its matrix named, its range what it assumes.
+        """Whether FFmpeg shows this as it is meant: 8 bits, finished, its matrix named, its range what it assumes.
 
-        Measured with FFmpeg 5.1: it reads untagged pictures as BT.601 whatever their size, passes over a full range
-        unless the format is called yuvj, and is up to 4 of 255 codes off for subsampled chroma of 10 bits.
+        Measured with torchcodec and FFmpeg 5.1: it reads untagged pictures as BT.601 whatever their size, passes over a
+        full range unless the format is called yuvj, and is up to 4 of 255 codes off for subsampled chroma of 10 bits.
         """
         curve = self.curve(said)
         if self.bits > 8 or curve is not Transfer.SDR or self.gamut(curve) != BT709:

@@ -1,8 +1,8 @@
-"""Frames of a video by number, decoded by PyAV as they are stored, for what torchcodec does not show as it is meant."""
+"""Frames of a video by number, decoded by PyAV; FFmpeg converts what it shows as it is meant, we convert the rest."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import av
@@ -11,6 +11,9 @@ import numpy as np
 from packuv.footage.coding import Coding
 from packuv.footage.develop import Developer
 from packuv.footage.transfer import Transfer
+
+Develop = Callable[[av.VideoFrame], np.ndarray]
+"""Makes a decoded frame a picture, uint8 [H, W, 3]"""
 
 
 class ExactDecoder:
@@ -22,7 +25,7 @@ class ExactDecoder:
         self._stream = self._container.streams.video[0]
         self._stream.codec_context.thread_count = threads
         coding = Coding.of(self._stream)
-        self._developer = Developer(coding, coding.curve(said))
+        self._develop: Develop = _converted if coding.plain(said) else Developer(coding, coding.curve(said)).picture
         self._ticks, self._keys = ticks, keys
         self._frames: Iterator[av.VideoFrame] = iter(())
         self._at: int | None = None
@@ -33,7 +36,7 @@ class ExactDecoder:
         decoded = self._frame(frame)
         assert self._stream.time_base is not None
         assert decoded.pts is not None
-        return self._developer.picture(decoded), decoded.pts * float(self._stream.time_base)
+        return self._develop(decoded), decoded.pts * float(self._stream.time_base)
 
     def _frame(self, wanted: int) -> av.VideoFrame:
         keys = self._keys[self._keys <= wanted]
@@ -65,3 +68,12 @@ class ExactDecoder:
                 begun = begun or decoded.pts == start or (decoded.key_frame and decoded.pts < start)
             if begun and not decoded.is_corrupt:
                 yield decoded
+
+
+def _converted(frame: av.VideoFrame) -> np.ndarray:
+    """By FFmpeg, with the matrix and the range that the frame is tagged with.
+
+    By one thread: with several, FFmpeg 8.0's conversion now and then loses pixels.
+    """
+    picture: np.ndarray = frame.reformat(format="rgb24", interpolation="BILINEAR", threads=1).to_ndarray()
+    return picture

@@ -29,8 +29,8 @@ class FrameReader:
     A step back, or past the next key frame, seeks. Safe to use from several threads.
 
     Every picture is display-referred sRGB, whatever its video holds: more than 8 bits are rounded once, at the end, and
-    log curves become light before (`packuv.footage.transfer`). torchcodec decodes what it shows as it is meant,
-    8-bit video with its matrix named; PyAV decodes the rest, whose planes we convert.
+    log curves become light before (`packuv.footage.transfer`). PyAV decodes. FFmpeg makes pictures of what it shows as
+    it is meant, 8-bit video with its matrix named; of the rest we convert the planes.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class FrameReader:
             decoder = self._decoders.pop(camera, None)
         if decoder is None:
             path, packets = self.videos[camera], self._packets(camera)
-            if packets.coding.plain(self.transfer):
+            if packets.coding.plain(self.transfer) and packets.coding.coarse:
                 decoder = TorchDecoder(path, threads=self._threads)
             else:
                 decoder = ExactDecoder(path, packets.ticks, packets.keys, said=self.transfer, threads=self._threads)
@@ -139,7 +139,7 @@ class FrameReader:
 
 
 class TorchDecoder:
-    """One open video that FFmpeg's own conversion shows as it is meant, see `Coding.plain`."""
+    """One open video with chroma coarser than FFmpeg's versions agree about, see `Coding.coarse`."""
 
     def __init__(self, path: Path, *, threads: int) -> None:
         # Here, since it takes seconds, and torch; many processes read no video.

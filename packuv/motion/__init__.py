@@ -5,7 +5,7 @@ from packuv.motion.cache import MotionCache, measure_motion
 from packuv.motion.follow import Change, Follower
 from packuv.motion.keyframes import KeyframeOptions
 from packuv.motion.plate import Plate, compare_plate
-from packuv.motion.step import MotionOptions, changed_between
+from packuv.motion.step import MotionOptions, changed_between, one_opencv_thread
 
 __all__ = [
     "BackgroundOptions",
@@ -21,5 +21,6 @@ __all__ = [
     "find_background",
     "load_stills",
     "measure_motion",
+    "one_opencv_thread",
     "save_stills",
 ]

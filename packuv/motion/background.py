@@ -7,6 +7,7 @@ it first paints no head onto the wall behind it, and has the wall that a step as
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
@@ -50,17 +51,29 @@ class Still:
 
 
 def find_background(
-    views: Views, options: BackgroundOptions, progress: Progress = no_progress, *, least: int = 3
+    views: Views,
+    options: BackgroundOptions,
+    progress: Progress = no_progress,
+    *,
+    least: int = 3,
+    workers: int = 2,
 ) -> list[Still]:
-    """Backgrounds of the cameras that filmed at least `least` of the chosen instants; an empty stage needs one."""
+    """Backgrounds of the cameras that filmed at least `least` of the chosen instants; an empty stage needs one.
+
+    `workers` cameras at a time, each with the pictures of all instants in memory.
+    """
     instants = np.unique(np.linspace(0, len(views) - 1, min(options.instants, len(views))).round().astype(int))
-    stills = []
-    for camera in range(len(views.cameras)):
+
+    def look(camera: int) -> Still | None:
         pictures = [views.steady(camera, int(instant), remember=False) for instant in instants]
         found = [picture for picture in pictures if picture is not None]
-        if len(found) >= least:
-            stills.append(_still(camera, np.stack(found), options))
-        progress(camera + 1, len(views.cameras))
+        return _still(camera, np.stack(found), options) if len(found) >= least else None
+
+    stills = []
+    with ThreadPoolExecutor(workers) as pool:
+        for camera, still in enumerate(pool.map(look, range(len(views.cameras)))):
+            stills += [still] if still else []
+            progress(camera + 1, len(views.cameras))
     return stills
 
 

@@ -11,22 +11,29 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import cv2
 import numpy as np
 
 from packuv.camera import PinholeCamera
 from packuv.files import save_json
 from packuv.footage import Views
-from packuv.motion.step import MotionOptions, Step, fitted_size, grey, grown, measure_step, options_from_json
+from packuv.motion.step import (
+    MotionOptions,
+    Step,
+    fitted_size,
+    grey,
+    grown,
+    measure_step,
+    one_opencv_thread,
+    options_from_json,
+)
 from packuv.progress import Progress, no_progress
 
 FORMAT = 1
@@ -57,7 +64,7 @@ def measure_motion(
     _claim(folder, _recipe(views, options))
     todo = [_CameraFiles(folder, views.cameras[index], len(views), options) for index in range(len(views.cameras))]
     tally = _Tally(len(views) * len(todo), progress)
-    with _one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
+    with one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
         jobs = [pool.submit(_measure_camera, views, index, todo[index], options, tally) for index in range(len(todo))]
         try:
             for job in as_completed(jobs):
@@ -78,17 +85,6 @@ class _Tally:
         with self._lock:
             self._done += count
             self._progress(self._done, self._total)
-
-
-@contextmanager
-def _one_opencv_thread() -> Iterator[None]:
-    """Cameras run in parallel, so OpenCV need not split each picture as well."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def _measure_camera(views: Views, camera: int, files: _CameraFiles, options: MotionOptions, tally: _Tally) -> None:

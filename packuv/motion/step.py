@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 
 from packuv.footage import Views
+from packuv.motion.masks import beyond, change, connected, filled
 
 
 class MotionBackend(StrEnum):
@@ -108,7 +110,7 @@ def measure_step(before: np.ndarray, after: np.ndarray, options: MotionOptions) 
     speed = cv2.resize(np.hypot(vectors[..., 0], vectors[..., 1]), size)  # [hm, wm]
     mask, noise = changed(_shrunk(before, size), _shrunk(after, size), options)
     if options.evidence is Evidence.CHANGE:
-        mask = _filled(_closed(mask, options.closing_px), speed > options.tau_px, options.hole_share)
+        mask = filled(_closed(mask, options.closing_px), speed > options.tau_px, options.hole_share)
     else:
         mask = speed > options.tau_px
     return Step(vectors, mask, float((speed * mask).mean()), noise)
@@ -135,15 +137,12 @@ def changed(before: np.ndarray, after: np.ndarray, options: MotionOptions) -> tu
     A pixel needs `low_sigmas`, and a connection to one with `high_sigmas`. A change of the whole picture by the same
     amount (mains flicker) does not count.
     """
-    difference = after.astype(np.float32) - before
-    difference -= np.median(difference[::2, ::2])
-    size = np.abs(cv2.GaussianBlur(difference, (0, 0), options.blur_px))
+    size = np.abs(cv2.GaussianBlur(change(before, after), (0, 0), options.blur_px))
     noise = max(_still_deviation(size), options.noise_floor)
-    # Codecs spend fewer bits on edges, and a shaking rig moves them: 2 % of the local contrast is no change.
     smooth = cv2.GaussianBlur(before, (0, 0), 1.0)
-    slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8))
-    score = size / (noise + 0.02 * slope)
-    return _connected(score > options.low_sigmas, score > options.high_sigmas, options.least_area_px), noise
+    slopes = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    low, high = beyond(size, *slopes, noise=noise, low=options.low_sigmas, high=options.high_sigmas)
+    return connected(low, high, options.least_area_px), noise
 
 
 def fitted_size(width: int, height: int, limit: int) -> tuple[int, int]:
@@ -206,17 +205,6 @@ def _still_deviation(size: np.ndarray) -> float:
     return float(np.median(quartiles)) / 1.15
 
 
-def _connected(low: np.ndarray, high: np.ndarray, least_area: int) -> np.ndarray:
-    """Components of `low` that hold a pixel of `high` and at least `least_area` pixels, bool [h, w]."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(low.astype(np.uint8), connectivity=8)
-    keep = np.zeros(count, dtype=bool)
-    keep[labels[high]] = True
-    keep &= stats[:, cv2.CC_STAT_AREA] >= least_area
-    keep[0] = False
-    kept: np.ndarray = keep[labels]
-    return kept
-
-
 def _closed(mask: np.ndarray, radius_px: int) -> np.ndarray:
     """Closing by a disc, as if the mask went on beyond the border by nothing, bool [h, w]."""
     if not radius_px:
@@ -226,14 +214,15 @@ def _closed(mask: np.ndarray, radius_px: int) -> np.ndarray:
     return cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(radius_px))[inner, inner] > 0
 
 
-def _filled(outline: np.ndarray, moving: np.ndarray, hole_share: float) -> np.ndarray:
-    """The outline with its holes, bounded by the border too, if small and more than half moving, bool [h, w]."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((~outline).astype(np.uint8), connectivity=4)
-    area = stats[:, cv2.CC_STAT_AREA]
-    inside = (np.bincount(labels[moving], minlength=count) > 0.5 * area) & (area <= hole_share * outline.size)
-    inside[0] = True  # label 0 is the outline itself
-    filled: np.ndarray = inside[labels]
-    return filled
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """Cameras run in parallel, so OpenCV need not split each picture as well."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def options_from_json(data: Mapping[str, Any]) -> MotionOptions:

@@ -59,7 +59,8 @@ class FindBackground(Stage):
     options: BackgroundOptions
 
     def build(self, work: Work) -> Notes:
-        stills = find_background(Footage(self.take, work.site).open_views(), self.options, work.progress)
+        views, threads = Footage(self.take, work.site).open_views(), work.site.threads
+        stills = find_background(views, self.options, work.progress, workers=threads)
         save_stills(work.out / STILLS, stills)
         return {"cameras": len(stills), "known_share": float(np.mean([still.known.mean() for still in stills] or [0]))}
 

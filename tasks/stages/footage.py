@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -135,8 +136,10 @@ class Footage:
 
     def filmed(self, instant: int) -> dict[str, np.ndarray]:
         """Pictures as filmed, uint8 [H, W, 3] RGB, of the cameras that have one at this instant of the take."""
-        reader, frames = self.open_reader(), self.load_frames()
-        return {name: reader.read(name, numbers[instant]) for name, numbers in frames.items() if numbers[instant] >= 0}
+        reader = self.open_reader()
+        frames = {name: int(numbers[instant]) for name, numbers in self.load_frames().items() if numbers[instant] >= 0}
+        with ThreadPoolExecutor(self.site.threads) as pool:
+            return dict(zip(frames, pool.map(reader.read, frames, frames.values()), strict=True))
 
     def open_reader(self) -> FrameReader:
         """Pictures as filmed, by camera and number of the frame."""

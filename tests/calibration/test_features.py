@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.features import Band, FeatureOptions, Features, detect, match, pairs_by_look
+from calibration.features import Band, FeatureOptions, Features, _all_rivals, _rivals, detect, match, pairs_by_look
 from calibration.tracks import Link, chain
 from tests.support.calibration_scene import filmed
 
@@ -50,6 +50,17 @@ def test_matches_equal_a_naive_twin(n, m, seed, ratio, banded):
     rows, distances = match(features(a), features(b), ratio=ratio, band=band if banded else None)
     assert list(map(tuple, rows.tolist())) == (naive(a, b, allowed, ratio) if n and m else [])
     assert distances.tolist() == [((a[i] - b[j]) ** 2).sum() for i, j in rows.tolist()]
+
+
+@pytest.mark.parametrize("largest", [2, 90, 5000])
+def test_products_of_matrices_find_the_rivals_that_sums_find(largest):
+    """Also over several blocks, for equal distances, and where float32 would round."""
+    rng = np.random.default_rng(largest)
+    a, b = (rng.integers(0, largest + 1, (count, 128)).astype(np.int16) for count in (600, 300))
+    b[:100] = a[500:]
+    everything = np.zeros((600, 3)), np.zeros((300, 3)), np.ones(600), np.ones(300)
+    found, wanted = _all_rivals(a, b), _rivals(a, b, *everything)
+    assert all(np.array_equal(x, y) for x, y in zip(found, wanted, strict=True))
 
 
 def test_a_picture_gives_the_same_features_twice_sorted_by_place():

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from packuv.metrics import LEAST_FRAMES, psnr, ssim, trend
+from packuv.metrics import LEAST_FRAMES, likenesses, psnr, ssim, trend
 
 
 def plain_ssim(a: np.ndarray, b: np.ndarray) -> float:
@@ -63,6 +63,14 @@ def test_ssim_laws():
     assert -1 <= ssim(a, b) < 1
     assert ssim(a[:, ::-1], b[:, ::-1]) == pytest.approx(ssim(a, b), abs=1e-12)
     assert ssim(1 - b, b) < 0
+
+
+def test_several_pictures_are_as_like_as_each_is_alone():
+    truth = pictures((3, 24, 30))[1]
+    some = [pictures((3, 24, 30), noise)[0] for noise in (0.02, 0.1, 0.5)]
+    some.append(2 * some[0] - np.float32(0.5))  # beyond [0, 1]
+    assert likenesses(some, truth) == [(psnr(picture, truth), ssim(picture, truth)) for picture in some]
+    assert likenesses([], truth) == []
 
 
 def test_ssim_of_one_window():

@@ -106,6 +106,19 @@ def test_raw_scores_are_those_of_the_scene_in_its_light(tmp_path):
     assert max(raw[1:]) < 30
 
 
+def test_scores_do_not_depend_on_the_number_of_workers(tmp_path):
+    path = write_wall(tmp_path / "lit.mkv", LIGHT)
+    rng = np.random.default_rng(0)
+    film(tmp_path / "a.mp4", rng.random((3, 3, 64, 96)).astype(np.float32))
+    videos = {name: tmp_path / "a.mp4" for name in "ab"}
+    lenses = [LensCamera(replace(CAMERA, name=name)) for name in "ab"]
+    frames = np.array([[0, 0], [1, -1], [2, 2]])
+    with open_scene(path) as scene:
+        one, many = (score(scene, Views(videos, frames, lenses), no_progress, workers=n) for n in (1, 3))
+    assert one == many
+    assert [(item.frame, item.camera) for item in one] == [(0, "a"), (0, "b"), (1, "a"), (2, "a"), (2, "b")]
+
+
 # ---- moving and still areas
 
 HEIGHT, WIDTH = 90, 160

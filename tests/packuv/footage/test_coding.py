@@ -1,4 +1,4 @@
-"""What torchcodec shows as it is meant stays with it, to the byte; the rest is taken from it."""
+"""What FFmpeg shows as it is meant keeps the bytes that torchcodec gives it; the rest is taken from it."""
 
 from __future__ import annotations
 
@@ -51,13 +51,17 @@ def test_primaries_are_the_cameras_for_log_and_the_tags_for_the_rest() -> None:
     assert coding("yuv420p10le", 10, **UNTAGGED).gamut(Transfer.SDR) == BT709
 
 
+@pytest.mark.parametrize("name", ["yuv420p", "yuv422p", "yuv444p", "yuv440p"])
 @pytest.mark.parametrize("matrix", [1, 5])
-def test_8_bit_video_keeps_the_bytes_of_torchcodec(tmp_path: Path, matrix: int) -> None:
+@pytest.mark.parametrize("size", [(48, 64), (38, 54)])
+def test_8_bit_video_keeps_the_bytes_of_torchcodec(
+    tmp_path: Path, matrix: int, name: str, size: tuple[int, int]
+) -> None:
     from torchcodec.decoders import VideoDecoder  # here, since it takes seconds
 
     rng = np.random.default_rng(0)
-    planes = [rng.integers(16, 235, shape).astype(np.uint8) for shape in shapes("420", 48, 64)]
-    path = write_planes(tmp_path / "a.mkv", "yuv420p", [planes], (matrix, 1, matrix, matrix))
+    planes = [rng.integers(16, 235, shape).astype(np.uint8) for shape in shapes(name[3:6], *size)]
+    path = write_planes(tmp_path / "a.mkv", name, [planes], (matrix, 1, matrix, matrix))
     plain = VideoDecoder(str(path), dimension_order="NHWC").get_frame_at(0).data.numpy()
     assert np.array_equal(FrameReader({"a": path}).read("a", 0), plain)
 

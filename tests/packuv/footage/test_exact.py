@@ -1,4 +1,4 @@
-"""Frames of 10 bits by number: the frame asked for, in whatever order, or an error."""
+"""Frames by number: the frame asked for, in whatever order, or an error."""
 
 from __future__ import annotations
 
@@ -51,6 +51,19 @@ def test_any_order_gives_what_one_pass_gives(tmp_path: Path, file: str) -> None:
     order = [*range(6), *np.random.default_rng(0).permutation(COUNT).tolist(), 47, 0, *range(9, 15)]
     for number in order:
         assert np.array_equal(reader.read("a", number), truth[number]), f"frame {number}"
+
+
+def test_8_bit_frames_in_any_order_are_those_of_torchcodec(tmp_path: Path) -> None:
+    from torchcodec.decoders import VideoDecoder  # here, since it takes seconds
+
+    frames = [[plane // 4 for plane in planes] for planes in sliding("yuv420p10le")]
+    frames = [[plane.astype(np.uint8) for plane in planes] for planes in frames]
+    options = {"g": "12", "bf": "3", "flags": "-cgop", "x264-params": "open-gop=1"}
+    path = write_planes(tmp_path / "a.mp4", "yuv420p", frames, (1, 1, 1, 1), codec="libx264", options=options)
+    decoder, reader = VideoDecoder(str(path), dimension_order="NHWC", seek_mode="exact"), FrameReader({"a": path})
+    for number in [*range(6), *np.random.default_rng(0).permutation(COUNT).tolist(), 47, 0, *range(9, 15)]:
+        wanted = decoder.get_frame_at(number).data.numpy()
+        assert np.array_equal(reader.read("a", number), wanted), f"frame {number}"
 
 
 def test_a_cut_file_gives_true_frames_or_an_error(tmp_path: Path) -> None:
