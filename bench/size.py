@@ -161,7 +161,7 @@ def options_of(case: Case) -> FitOptions:
         frame_iterations=count,
         key_births=max(500, case.gaussians // 10),
         # All on the shell: as thin as what is fitted long, where balls that fill the room overlap ten times as much.
-        start=StartOptions(count=case.gaussians, surface_share=0.0, shell_share=1.0),
+        start=StartOptions(count=case.gaussians, surface_share=1.0),
         shell=ShellOptions(steps=12),  # the sweep is no iteration; its memory does not depend on this
         density=DensityOptions(cap=round(case.gaussians / 0.88), every=10**6),
     )

@@ -47,7 +47,7 @@ _PRESETS: Mapping[str, Mapping[str, Any]] = {
             "key_iterations": 800,
             "frame_iterations": 480,
             "settle": 0.02,
-            "start": {"count": 30_000},
+            "start": {"count": 48_000},
             "density": {"cap": 68_000},
         },
     },

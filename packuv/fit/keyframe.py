@@ -47,6 +47,8 @@ LEAST_KNOWN = 0.5
 """Share of the pictures that must be known to stand still for a backdrop"""
 FOREGROUND_GAIN = 0.01
 """Share of the loss that the bands of a keyframe's own Gaussians must gain; without, they cost nothing in the file"""
+BIRTH_OPACITY = 0.1
+"""Of what is born in a hull, which is mostly air"""
 DEAD_CODE = 1
 """Opacity codes up to this one decode below 1/255, which no renderer draws"""
 
@@ -148,6 +150,7 @@ def _fit_all(
     progress: Progress,
 ) -> KeyState:
     started = time.monotonic()
+    options = replace(options, start=options.start.within(options.density.cap))
     bounds = find_bounds(views.cameras, near_share=options.near_share)
     rng = np.random.default_rng([options.seed, 0 if instant is None else instant, 0])
     cameras, targets = [shot.camera for shot in shots], Each(lambda index: _undone(shots[index]), len(shots))
@@ -156,7 +159,7 @@ def _fit_all(
                             options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
     model = Model(start)
     solver = Solver(model, bounds, options, rng)
-    total, grow_from = options.iterations, options.start.count
+    total, grow_from = options.iterations, len(model)
     ticks = Ticks(progress, total)
     judges = left_out(cameras) if options.sh_degree else []
     coarse, floating = round(total * options.coarse_share), round(total * options.float_share)
@@ -311,14 +314,12 @@ def _those(things: Sequence[np.ndarray | None], places: Sequence[int]) -> Each[n
 
 
 def _surface(shell: Shell | None, points: Points | None, options: FirstOptions) -> Points:
-    """Where surfaces are: sparse points, sure places of the shell, and the rest of the shell evenly."""
+    """Where surfaces are: sparse points, and the shell."""
     start, rng = options.start, np.random.default_rng([options.seed, 3])
     room = round(start.count * start.surface_share)
-    parts = [] if points is None else [drawn(points, room, rng)]
+    parts = [no_points()] if points is None else [drawn(points, room // 2, rng)]
     if shell is not None:
-        parts.append(shell.sure_points(room - sum(len(part.xyz) for part in parts), rng))
-        parts.append(shell.cover(round(start.count * start.shell_share)))
-    parts = parts or [no_points()]
+        parts.append(shell.places(room - len(parts[0].xyz), rng))
     return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
 
 
@@ -359,7 +360,7 @@ def _hull_gaussians(
                          bounds=bounds, options=options.start, count=options.key_births, rng=rng)  # fmt: skip
     spacing = neighbour_distance(points.xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 0.02 * bounds.radius)
-    born = round_gaussians(points.xyz, points.rgb, scale, opacity=options.start.opacity, sh_degree=sh_degree)
+    born = round_gaussians(points.xyz, points.rgb, scale, opacity=BIRTH_OPACITY, sh_degree=sh_degree)
     return with_canonical_axes(born)
 
 

@@ -25,18 +25,20 @@ _CANDIDATES = 16
 
 @dataclass(frozen=True)
 class StartOptions:
-    count: int = 22_000
-    """Gaussians at the start"""
+    count: int = 42_000
+    """Gaussians at the start, or as many as the cap allows"""
     volume: float = 1.25
     """Random Gaussians fill a ball of this many radii about the centre"""
     min_views: int = 3
     """Cameras that must see a random Gaussian; all of them in smaller rigs"""
-    surface_share: float = 0.45
-    """At most this share starts on places that cameras agree on: triangulated points and sure places of the shell"""
-    shell_share: float = 0.3
-    """This share covers the rest of the shell evenly; what is left fills the volume"""
-    opacity: float = 0.1
+    surface_share: float = 0.9
+    """At most this share starts on surfaces: triangulated points and the shell; what is left fills the volume"""
+    opacity: float = 0.3
     """Opacity of every Gaussian at the start"""
+
+    def within(self, cap: int) -> StartOptions:
+        """The same for so many Gaussians at most."""
+        return replace(self, count=min(self.count, cap))
 
 
 def first_gaussians(

@@ -26,6 +26,12 @@ from packuv.raster.view import VIEW_CX, VIEW_CY, VIEW_FX, VIEW_FY, VIEW_HEIGHT, 
 
 MOST_PIXELS = 8
 """Across a direction; pictures with more are halved before the sweep"""
+SURE_SHARE, EVEN_SHARE = 0.07, 0.55
+"""Of the places that a fit starts from: those that cameras agree on, and those that would cover the sphere evenly.
+On "basketball" 1,500 iterations from more of them and denser detail reach 30.4 dB and SSIM 0.948 in nine cameras left
+out, 29.8 and 0.942 from 22,000 even and sure places; from detail alone smooth floors turn to haze"""
+STRONG, FAINT = 0.3, 0.01
+"""Contrast beyond which there are no more places, and what smooth places count as, in brightness 0 to 1"""
 
 
 @dataclass(frozen=True)
@@ -85,14 +91,20 @@ class Shell:
         inside, rows, columns = pixels_of(camera, xyz, near)
         return SparseDepth(rows * camera.width + columns, camera.project(xyz[inside])[1].astype(np.float32))
 
-    def sure_points(self, count: int, rng: np.random.Generator) -> Points:
-        """At most `count` of the places that cameras agree on, evenly over the sphere."""
-        polar = (np.arange(len(self.sure)) + 0.5) / len(self.sure) * np.pi
-        weight = np.broadcast_to(np.sin(polar)[:, None], self.sure.shape)
-        return drawn(Points(self.xyz[self.sure], self.rgb[self.sure]), count, rng, weight=weight[self.sure])
+    def places(self, count: int, rng: np.random.Generator) -> Points:
+        """About `count` places of the surface: some that cameras agree on, some evenly over the rest of what is seen,
+        which cover smooth walls, and most of the others where the surface has detail."""
+        sure, even = self._sure_points(round(SURE_SHARE * count), rng), self._cover(round(EVEN_SHARE * count))
+        fine = self._detailed(count - len(sure.xyz) - len(even.xyz), rng)
+        return Points(*(np.concatenate([getattr(part, name) for part in (sure, even, fine)]) for name in ("xyz", "rgb")))
 
-    def cover(self, count: int) -> Points:
-        """Places evenly over the rest of what is seen; `count` would cover the whole sphere."""
+    def _sure_points(self, count: int, rng: np.random.Generator) -> Points:
+        """At most `count` of the places that cameras agree on, evenly over the sphere."""
+        weight = self._solid_angles()[self.sure]
+        return drawn(Points(self.xyz[self.sure], self.rgb[self.sure]), count, rng, weight=weight)
+
+    def _cover(self, count: int) -> Points:
+        """Places evenly over what is seen and not sure; `count` would cover the whole sphere."""
         rows, columns = self.sure.shape
         turn = np.arange(count) + 0.5
         polar, azimuth = np.arccos(1 - 2 * turn / max(count, 1)), np.pi * (1 + math.sqrt(5)) * turn  # Fibonacci
@@ -101,6 +113,23 @@ class Shell:
         open_places = self.seen & ~_grown(self.sure, 2)
         chosen = open_places[v, u]
         return Points(self.xyz[v, u][chosen], self.rgb[v, u][chosen])
+
+    def _detailed(self, count: int, rng: np.random.Generator) -> Points:
+        """At most `count` places that are seen, the denser the more their surroundings differ in brightness."""
+        weight = (np.minimum(contrast(self.rgb.mean(axis=2)), STRONG) + FAINT) * self._solid_angles()
+        return drawn(Points(self.xyz[self.seen], self.rgb[self.seen]), count, rng, weight=weight[self.seen])
+
+    def _solid_angles(self) -> np.ndarray:
+        """Of the directions' cells, up to a factor, float64 [V, U]."""
+        polar = (np.arange(len(self.sure)) + 0.5) / len(self.sure) * np.pi
+        return np.broadcast_to(np.sin(polar)[:, None], self.sure.shape)
+
+
+def contrast(brightness: np.ndarray) -> np.ndarray:
+    """Gradient of brightness over the sphere, float32 [V, U], Sobel's sum by the cell, smoothed; azimuth wraps."""
+    wide = cv2.copyMakeBorder(brightness.astype(np.float32), 0, 0, 4, 4, cv2.BORDER_WRAP)
+    steep = np.hypot(cv2.Sobel(wide, cv2.CV_32F, 1, 0), cv2.Sobel(wide, cv2.CV_32F, 0, 1))
+    return cv2.GaussianBlur(steep, (0, 0), 1.0)[:, 4:-4]
 
 
 def directions(columns: int) -> np.ndarray:

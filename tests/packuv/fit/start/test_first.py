@@ -114,3 +114,8 @@ def test_round_gaussians_render_the_colour_they_are_given():
     g = round_gaussians(np.zeros((1, 3)), np.array([[0.2, 0.4, 0.9]]), np.array([0.1]), opacity=0.7, sh_degree=0)
     np.testing.assert_allclose(0.5 + 0.28209479177 * g.sh[0, 0], [0.2, 0.4, 0.9], atol=1e-6)
     assert 1 / (1 + np.exp(-g.opacity_logits[0])) == pytest.approx(0.7, rel=1e-6)
+
+
+def test_a_fit_starts_with_no_more_than_its_cap():
+    assert StartOptions(count=300).within(200) == StartOptions(count=200)
+    assert StartOptions(count=300).within(400) == StartOptions(count=300)

@@ -3,7 +3,7 @@ import pytest
 
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
-from packuv.fit.start.shell import MOST_PIXELS, ShellOptions, coarse, directions, interpolate, sweep_shell
+from packuv.fit.start.shell import MOST_PIXELS, Shell, ShellOptions, coarse, directions, interpolate, sweep_shell
 
 RADII = np.array([5.0, 5.6, 4.7])
 """Half axes of the room in these tests: an ellipsoid about the origin"""
@@ -40,15 +40,25 @@ def test_places_that_cameras_agree_on_lie_on_the_wall(room):
     assert np.quantile(np.abs(off), 0.95) < 0.05
 
 
-def test_the_rest_of_the_wall_continues_what_is_sure(room):
+def test_places_lie_on_the_wall_also_where_nobody_agrees(room):
     shell = sweep_shell(*room, bounds=BOUNDS, options=OPTIONS)
     assert shell is not None
-    cover = shell.cover(2000)
-    assert 100 < len(cover.xyz) < 2000
-    off = np.sqrt((cover.xyz**2 / RADII**2).sum(-1)) - 1
+    places = shell.places(2000, np.random.default_rng(0))
+    assert 0.8 * 2000 < len(places.xyz) <= 2000
+    off = np.sqrt((places.xyz**2 / RADII**2).sum(-1)) - 1
     assert np.median(np.abs(off)) < 0.1
-    assert cover.rgb.min() >= 0
-    assert cover.rgb.max() <= 1
+    assert places.rgb.min() >= 0
+    assert places.rgb.max() <= 1
+
+
+def test_places_are_denser_where_the_wall_has_detail():
+    rays = directions(64)
+    striped, seen = rays[:, :, 0] > 0, np.ones(rays.shape[:2], bool)
+    grey = np.where(striped & (np.arange(64) % 4 < 2), 0.9, 0.4)
+    shell = Shell(rays, np.repeat(grey[:, :, None], 3, axis=2), ~seen, seen, np.zeros((*seen.shape, 1), bool))
+    xyz = shell.places(800, np.random.default_rng(0)).xyz
+    # 55 % are spread evenly, so half of the sphere has 28 % of them by these alone.
+    assert 0.25 * 800 < (xyz[:, 0] < 0).sum() < 0.35 * 800
 
 
 def test_pictures_finer_than_the_sphere_are_halved_first(room):
@@ -69,12 +79,12 @@ def test_pictures_finer_than_the_sphere_are_halved_first(room):
     assert np.array_equal(first.xyz, again.xyz)
 
 
-def test_sure_points_are_drawn_by_the_seed(room):
+def test_places_are_drawn_by_the_seed(room):
     shell = sweep_shell(*room, bounds=BOUNDS, options=OPTIONS)
     assert shell is not None
-    first, again = (shell.sure_points(500, np.random.default_rng(3)).xyz for _ in range(2))
-    assert len(first) == 500
+    first, again, other = (shell.places(500, np.random.default_rng(seed)).xyz for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
 
 
 def test_blank_walls_have_no_shell(room):
