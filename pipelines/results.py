@@ -116,6 +116,7 @@ def _artefact(store: Store, key: Any) -> dict[str, Any]:
     return {
         "artefact": str(key),
         "seconds": receipt.seconds,
+        "cpu_seconds": receipt.cpu_seconds,
         "peak_memory_bytes": receipt.peak_memory_bytes,
         "bytes": receipt.size_bytes,
         "finished": receipt.finished,
