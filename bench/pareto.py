@@ -3,9 +3,10 @@
     packuv bench pareto CAPTURE --out runs/pareto.json --frames 0:30 --hold-out cam05 cam14 cam23
     packuv bench pareto CAPTURE --out runs/pareto.json --frames 0:30 --hold-out cam05 cam14 cam23 --knobs iterations uv
 
-Writes, after every point, the JSON file, a table beside it as .md and a plot as .svg. A point that the file has with the
-same request is not run again, and a run that was stopped goes on: the same command again. The file says of which
-request each point is; remove it after a change of the program.
+Writes, after every point, the JSON file, a table beside it as .md and a plot as .svg. A point that the file has with
+the same request is not run again, and a run that was stopped goes on: the same command again. The file says of which
+request each point is; remove it after a change of the program. The first run on a machine compiles kernels for a minute
+or two, which is in the costs of its stages: have `packuv run` run once before.
 """
 
 from __future__ import annotations
@@ -135,7 +136,7 @@ def front(costs: Sequence[float], levels: Sequence[float]) -> list[int]:
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows in Markdown; differences are to the base."""
     lines = [
-        "| knob | value | PSNR, dB | | own gain | SSIM | moving | still | fits, CPU s | all, CPU s | | MB per 30 frames | GB |",
+        "| knob | value | PSNR, dB | | own gain | SSIM | moving | still | fits, CPU s | all, CPU s | | MB / 30 frames | GB |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     best = {id(rows[index]) for index in front(*_axes(rows))}
@@ -150,7 +151,9 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
             f"{still} | {row['fit_cpu_seconds']:.0f} | {row['cpu_seconds']:.0f} | {cost} | "
             f"{row['mb_per_30_frames']:.2f} | {row['peak_memory_bytes'] / 1e9:.2f} |"
         )
-    return "\n".join([*lines, "", "CPU seconds are those of all stages but scoring; bold: nothing is as cheap and as good."])
+    return "\n".join(
+        [*lines, "", "CPU seconds are those of all stages but scoring; bold: nothing is as cheap and as good."]
+    )
 
 
 def _axes(rows: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[float]]:
@@ -195,8 +198,9 @@ def plot(rows: Sequence[Mapping[str, Any]]) -> str:
         parts += _knob(scale, knob, own, rows[0], number)
     x, y = scale.place(costs[0], levels[0])
     parts.append(f'<circle cx="{x}" cy="{y}" r="6" fill="none" stroke="black"><title>base</title></circle>')
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" font-family="sans-serif" font-size="12">'
-    return f'{head}<rect width="{WIDTH}" height="{HEIGHT}" fill="white"/>{"".join(parts)}</svg>\n'
+    look = f'viewBox="0 0 {WIDTH} {HEIGHT}" font-family="sans-serif" font-size="12"'
+    start = f'<svg xmlns="http://www.w3.org/2000/svg" {look}>'
+    return f'{start}<rect width="{WIDTH}" height="{HEIGHT}" fill="white"/>{"".join(parts)}</svg>\n'
 
 
 def _knob(

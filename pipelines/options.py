@@ -48,7 +48,8 @@ def compose(
     seed: int = 0,
     quality: str = Quality.LOSSLESS,
 ) -> SequenceOptions:
-    """Options of a run: those of the preset, or of another point of the ladder, then what capture.toml says, then the user's settings.
+    """Options of a run: those of the preset, or of another point of the ladder, then what capture.toml says, then the
+    user's settings.
 
     Raises OptionError that names an unknown setting, with the valid names, or a value of the wrong kind.
     """

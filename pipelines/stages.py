@@ -215,7 +215,8 @@ class Sequence:
 
     def score(self, cameras: tuple[str, ...], pictures: PictureOptions) -> Key:
         """Scores of the scene on these cameras, against pictures of this size; noted in `made`, as in a run."""
-        return self._make(self._evaluation(replace(self._take("points"), cameras=cameras, pictures=pictures, stop=None)))
+        take = replace(self._take("points"), cameras=cameras, pictures=pictures, stop=None)
+        return self._make(self._evaluation(take))
 
     def _evaluation(self, take: Take) -> Evaluate:
         """With LPIPS, where the file of weights and the package for it are there."""
