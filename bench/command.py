@@ -10,7 +10,18 @@ import importlib
 
 from pipelines.plugins import Add
 
-BENCHMARKS = ("ablation", "codec", "kills", "motion", "pareto", "raster", "sequence", "stress_fit", "sync_index")
+BENCHMARKS = (
+    "ablation",
+    "codec",
+    "kills",
+    "motion",
+    "pareto",
+    "raster",
+    "sequence",
+    "skips",
+    "stress_fit",
+    "sync_index",
+)
 
 
 def register(add: Add) -> None:

@@ -136,7 +136,7 @@ def front(costs: Sequence[float], levels: Sequence[float]) -> list[int]:
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows in Markdown; differences are to the base."""
     lines = [
-        "| knob | value | PSNR, dB | | own gain | SSIM | moving | still | fits, CPU s | all, CPU s | | MB / 30 frames | GB |",
+        "| knob | value | PSNR, dB | | own gain | SSIM | moving | still | fits, s | all, s | | MB per 30 frames | GB |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     best = {id(rows[index]) for index in front(*_axes(rows))}

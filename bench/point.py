@@ -71,12 +71,15 @@ class Base:
         return tuple(held)
 
 
-def add_arguments(parser: argparse.ArgumentParser, preset: Preset = "draft") -> None:
-    """The arguments of a benchmark that measures points."""
-    parser.add_argument("capture", type=Path, help="capture folder")
+def add_arguments(parser: argparse.ArgumentParser, *, capture: bool = True) -> None:
+    """The arguments of a benchmark that measures points; without `capture` it makes its captures itself."""
+    if capture:
+        parser.add_argument("capture", type=Path, help="capture folder")
+    else:
+        parser.set_defaults(capture=Path("simulated"))
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write; the table goes beside it as .md")
     parser.add_argument("--work", type=Path, help="folder of the runs (beside --out)")
-    parser.add_argument("--preset", choices=PRESETS, default=preset)
+    parser.add_argument("--preset", choices=PRESETS, default=Base.preset)
     parser.add_argument("--frames", default=":", metavar="A:B")
     parser.add_argument("--hold-out", nargs="+", metavar="CAMERA")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of every point")

@@ -50,7 +50,7 @@ def affordable(request: RunRequest, points: Mapping[str, SequenceOptions], size:
         found.append(Priced(name, minutes, pilot))
     if not found:
         raise ValueError(
-            f"even the fastest settings ({name}) are forecast to take {spent + minutes:.1f} minutes on {machine.cores} "
+            f"even the fastest settings ({name}) are forecast to take {spent + minutes:.3g} minutes on {machine.cores} "
             f"cores, but {request.max_minutes:g} are allowed; allow more, or process fewer --frames"
         )
     return tuple(found)

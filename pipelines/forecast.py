@@ -105,7 +105,7 @@ def work_of(size: Size, options: SequenceOptions) -> dict[str, float]:
     filmed = sum(width * height for width, height in size.fitted + size.held_out) / 1e6
     fitted = sum(_pixels(*sides, options) for sides in size.fitted) / 1e6
     scored = sum(_pixels(*sides, options) for sides in size.held_out or size.fitted[:3]) / 1e6
-    one, gaussians = fitted / len(size.fitted), fit.density.cap / 1e3
+    one, gaussians = max(_pixels(*sides, options) for sides in size.fitted) / 1e6, fit.density.cap / 1e3
     segments = max(1.0, frames / SEGMENT)
     step = (one * gaussians) ** SPREAD
     return {
