@@ -3,9 +3,10 @@
     packuv bench skips --out runs/skips.json
     packuv bench skips --out runs/skips.json --scenes still 15 --skips "still frames" settle
 
-Each scene is a simulated capture of which so much moves: nothing, and about 2 %, 15 % and 60 % of the pictures. It is run
-as it is and once more without each skip. Saved are the CPU seconds, without scoring, that the skip spares; added is the
-error that it costs on the camera that is not fitted. A row that the file has with the same request is not run again.
+Each scene is a simulated capture of which so much moves: nothing, and about 2 %, 15 % and 60 % of the pictures. It is
+run as it is and once more without each skip. Saved are the CPU seconds, without scoring, that the skip spares; added is
+the error that it costs on the camera that is not fitted. A row that the file has with the same request is not run again,
+and a run that was stopped goes on.
 """
 
 from __future__ import annotations
