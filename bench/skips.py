@@ -5,8 +5,8 @@
 
 Each scene is a simulated capture of which so much moves: nothing, and about 2 %, 15 % and 60 % of the pictures. It is
 run as it is and once more without each skip. Saved are the CPU seconds, without scoring, that the skip spares; added is
-the error that it costs on the camera that is not fitted. A row that the file has with the same request is not run again,
-and a run that was stopped goes on.
+the error that it costs on the camera that is not fitted. A row that the file has with the same request is not run
+again, and a run that was stopped goes on.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from studio.film_set import MOVING
 
 SCENES: Mapping[str, Mapping[str, Any]] = {
     "still": {"movers": ()},
-    "2": {"movers": ("ball", "crate")},
+    "2": {"movers": ("crate",)},
     "15": {"movers": MOVING},
     "60": {"movers": MOVING, "crowd": 27},
 }
-"""What moves, as options of the studio, by the share of the pictures, %, that is meant"""
+"""What moves, as options of the studio, by share of the pictures, %: the truth says 0, 2.4, 13 and 63 %, on average"""
 NOTHING = "(all skips)"
 
 
@@ -144,9 +144,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         base = replace(common, capture=capture, work=common.work / scene, settings=(*SETTINGS, *common.settings))
         for row in run(base, given.skips, known):
             rows.append({"scene": scene, **row})
+            named = {(one["scene"], one["skip"]) for one in rows}
+            there = [*rows, *(one for one in known if (one["scene"], one["skip"]) not in named)]
             with whole_file(given.out) as part:
-                part.write_text(json.dumps({**head(common), "rows": rows}, indent=1) + "\n")
-            given.out.with_suffix(".md").write_text(table(rows) + "\n")
+                part.write_text(json.dumps({**head(common), "rows": there}, indent=1) + "\n")
+            given.out.with_suffix(".md").write_text(table(there) + "\n")
     print(table(rows))
 
 
