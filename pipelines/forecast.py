@@ -1,7 +1,7 @@
 """How long a run will take, from a cost model that finished runs on two cores were measured for.
 
 Every cost is a product of what the capture and the settings are and a figure that was measured; docs/pareto.md states
-the model, and `packuv bench forecast RUN...` compares it with runs.
+the model.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ SETTLE_EXPONENT = -0.75
 """From 170 at 0.02 to 48 at 0.1"""
 
 SECONDS: Mapping[str, float] = {
+    "starts": 1.5,
     "sync": 5.0e-4,
     "rig and points": 6.2,
     "light": 0.0168,
@@ -47,6 +48,7 @@ SECONDS: Mapping[str, float] = {
 }
 """Of one unit of each kind of work, see `work_of`: "basketball", 24 cameras of 640x360, 150 frames"""
 STAGE_OF: Mapping[str, str] = {
+    "starts": "sync",
     "sync": "sync",
     "rig and points": "calibrate",
     "light": "calibrate",
@@ -109,6 +111,7 @@ def work_of(size: Size, options: SequenceOptions) -> dict[str, float]:
     segments = max(1.0, frames / SEGMENT)
     step = (one * gaussians) ** SPREAD
     return {
+        "starts": 11 + 2 * segments,
         "sync": frames * (len(size.fitted) + len(size.held_out)),
         "rig and points": filmed,
         "light": frames * filmed * options.light.enabled,
