@@ -45,7 +45,7 @@ class Skip(NamedTuple):
 SKIPS: Mapping[str, Skip] = {
     # Every change counts as motion, however small.
     "still frames": Skip(
-        (), ("motion.low_sigmas=0", "motion.high_sigmas=0", "motion.noise_floor=0.001", "motion.least_area_px=0")
+        (), ("motion.low_sigmas=0.01", "motion.high_sigmas=0.02", "motion.noise_floor=0.001", "motion.least_area_px=0")
     ),
     # An ellipse without end meets every mask, so all that is before the backdrop is fitted, in all tiles.
     "tiles and labels": Skip(
