@@ -10,7 +10,19 @@ import importlib
 
 from pipelines.plugins import Add
 
-BENCHMARKS = ("ablation", "codec", "kills", "motion", "raster", "sequence", "size", "stress_fit", "sync_index")
+BENCHMARKS = (
+    "ablation",
+    "codec",
+    "kills",
+    "motion",
+    "pareto",
+    "raster",
+    "sequence",
+    "size",
+    "skips",
+    "stress_fit",
+    "sync_index",
+)
 
 
 def register(add: Add) -> None:

@@ -84,6 +84,11 @@ class Chain:
                 before = piece
                 yield piece[0], piece[1].result()
 
+    def pilot(self, span: range) -> tuple[Key, Key]:
+        """A keyframe at the start of the span, as the first one of a sequence is, and its segment."""
+        key = self._first(span.start) if self.backdrop is None else self._next(self.backdrop, span.start)
+        return key.result(), self._segment(key.result(), Span(1, span)).result()
+
     def _pieces(self, spans: Sequence[Span]) -> dict[int, Piece]:
         """Those whose keyframe goes on from no segment, by place: the first, side by side all of them, and without a
         backdrop those up to the one that most cameras filmed."""

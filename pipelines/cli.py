@@ -274,7 +274,22 @@ def _batch(command: argparse.ArgumentParser) -> None:
 
 def _how(command: argparse.ArgumentParser, *, stop: bool) -> None:
     """Options of a run, be it of one sequence or of many."""
-    command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
+    command.add_argument(
+        "--preset",
+        choices=PRESETS,
+        default=None,
+        help="trades time for quality (standard); with one of the next two, the finest that may be chosen (high)",
+    )
+    command.add_argument(
+        "--max-minutes", type=float, default=None, metavar="M", help="choose the finest settings that take no longer"
+    )
+    command.add_argument(
+        "--target-psnr",
+        type=float,
+        default=None,
+        metavar="DB",
+        help="choose the fastest settings that reach this on cameras held out",
+    )
     command.add_argument("--quality", choices=QUALITIES, default="lossless", help="how near the file stays to the fit")
     command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what fits and renders")
     command.add_argument(

@@ -10,7 +10,8 @@ from packuv.fit.options import FitOptions
 from packuv.footage import LightOptions, Transfer
 from packuv.motion import KeyframeOptions, MotionOptions
 from packuv.scene import TOLERANCES, EncodeOptions, Quality
-from pipelines.request import PRESETS, QUALITIES
+from pipelines.ladder import LADDER
+from pipelines.request import QUALITIES
 from sync.align import AlignOptions
 from sync.capture import TRANSFERS, CaptureSettings
 from tasks.artefacts.recipe import override
@@ -35,33 +36,6 @@ class SequenceOptions:
     evaluate: EvaluateOptions = field(default_factory=EvaluateOptions)
 
 
-_PRESETS: Mapping[str, Mapping[str, Any]] = {
-    "draft": {
-        "pictures": {"max_width": 640},
-        "fit": {"iterations": 900, "key_iterations": 200, "frame_iterations": 144, "settle": 0.1},
-    },
-    "standard": {
-        "pictures": {"max_width": 1280},
-        "fit": {
-            "iterations": 3000,
-            "key_iterations": 800,
-            "frame_iterations": 480,
-            "settle": 0.02,
-            "start": {"count": 48_000},
-            "density": {"cap": 68_000},
-        },
-    },
-    "high": {
-        "fit": {
-            "iterations": 15000,
-            "key_iterations": 4000,
-            "frame_iterations": 1200,
-            "settle": 0.005,
-            "sh_degree": 3,
-        },
-    },
-}
-assert tuple(_PRESETS) == PRESETS
 assert tuple(Quality) == QUALITIES
 assert tuple(Transfer) == TRANSFERS
 
@@ -74,11 +48,12 @@ def compose(
     seed: int = 0,
     quality: str = Quality.LOSSLESS,
 ) -> SequenceOptions:
-    """Options of a run: the preset's, then what capture.toml says, then the user's settings.
+    """Options of a run: those of the preset, or of another point of the ladder, then what capture.toml says, then the
+    user's settings.
 
     Raises OptionError that names an unknown setting, with the valid names, or a value of the wrong kind.
     """
-    options = override(SequenceOptions(), _PRESETS[preset])
+    options = override(SequenceOptions(), LADDER[preset])
     said = {"sync": {"reference": capture.reference, "clock": capture.clock}}
     options = override(options, {**said, "pictures": {"transfer": capture.transfer}})
     tolerance = asdict(TOLERANCES[Quality(quality)])

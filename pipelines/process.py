@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import shutil
@@ -16,10 +17,13 @@ from typing import Any
 from packuv.fit.device import choose_device
 from packuv.partial import partial_path
 from pipelines.chain import Submit
+from pipelines.choice import PILOT_FRAMES, Affordable, Priced, affordable, chosen_of
 from pipelines.events import Event, Journal
 from pipelines.folder import claim
+from pipelines.forecast import Machine, size_of
+from pipelines.ladder import up_to
 from pipelines.lender import lender_of
-from pipelines.options import compose
+from pipelines.options import SequenceOptions, compose
 from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
 from pipelines.results import Ending, Run, collect, ending_of, run_json
@@ -27,15 +31,17 @@ from pipelines.stages import Made, Sequence
 from sync.capture import Capture, check_name, find_capture
 from tasks.artefacts.jobs import CancelledError, Jobs
 from tasks.artefacts.originals import Originals
-from tasks.artefacts.recipe import write_json
+from tasks.artefacts.recipe import plain, write_json
 from tasks.artefacts.retention import RUN
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
+from tasks.report.facts import Choice
 from tasks.report.findings import Finding, findings
 from tasks.report.record import summary
 from tasks.report.write import write_report
 from tasks.stages.encode import SCENE
+from tasks.stages.evaluate import METRICS
 from tasks.stages.plan import Plan
 
 PARTIAL = "scene.partial.mkv"
@@ -60,6 +66,13 @@ class Outcome:
     events: tuple[Event, ...]
     findings: tuple[Finding, ...]
     """What in the results a person should look at"""
+    choice: Choice | None = None
+    """Where a time or an error was asked for"""
+
+    @property
+    def missed(self) -> str:
+        """By how much the error that was asked for is missed; empty where it is not."""
+        return self.choice.missed if self.choice else ""
 
     def to_json(self) -> dict[str, Any]:
         """For `packuv run --json`."""
@@ -68,6 +81,7 @@ class Outcome:
             "scene": self.scene and str(self.scene),
             "report": str(self.report),
             "summary": dict(self.figures),
+            "choice": plain(self.choice),
             "findings": [finding.text for finding in self.findings],
             "stages": [event.to_json() for event in self.events],
         }
@@ -75,6 +89,8 @@ class Outcome:
     def farewell(self) -> str:
         """The last lines of a run."""
         lines = [*_doubts(self.findings), *_quality(self.figures), f"results    {self.folder}"]
+        if self.choice:
+            lines.insert(0, f"chosen     {self.choice.told}")
         if self.scene:
             lines.append(f"scene      {self.scene}")
         lines.append(f"report     {self.report}")
@@ -125,7 +141,8 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     Raises ValueError or FileNotFoundError for bad input, OSError when the disk cannot hold the results, CancelledError
     when the jobs are cancelled, and what a failing stage raises. Whatever ends the run, no job goes on after it.
     """
-    sequence, run = prepare(request, journal, engine, jobs)
+    affordable = affordable_points(request)
+    sequence, run = prepare(request, journal, engine, jobs, affordable)
     folder, workshop = run.workshop.store.root.parent, run.workshop
     bury(folder, engine.crashed)
     on_record = registered(
@@ -133,6 +150,7 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     )
     with workshop.store.in_use(), on_record as register, journal.heard_by(register):
         try:
+            sequence, run = settle(sequence, run, engine, affordable)
             sequence.run(request.stop_after)
             outcome = _publish(run, folder)
         except BaseException as error:
@@ -143,7 +161,7 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
                 if isinstance(error, (Exception, KeyboardInterrupt)) and not isinstance(error, CancelledError):
                     _leave_finished(sequence, folder)
             raise
-        write_json(folder / RUN, run_json(run, Ending("finished")))
+        write_json(folder / RUN, run_json(replace(run, choice=outcome.choice), Ending("finished", outcome.missed)))
         return outcome
 
 
@@ -152,9 +170,8 @@ def is_made(request: RunRequest) -> bool:
     jobs = jobs_of(request)
     jobs.cancel("only looking")
     try:
-        prepare(request, Journal(), Engine(lambda make: lambda stage: There(make(stage))), jobs)[0].run(
-            request.stop_after
-        )
+        engine, affordable = Engine(lambda make: lambda stage: There(make(stage))), affordable_points(request)
+        settle(*prepare(request, Journal(), engine, jobs, affordable), engine, affordable)[0].run(request.stop_after)
     except Exception:  # whatever it is, the run itself meets it again
         return False
     return True
@@ -170,11 +187,67 @@ class There:
         return self.key
 
 
-def prepare(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -> tuple[Sequence, Run]:
-    """The stages of a run, and what it leaves; its folder is there and belongs to the capture."""
+def affordable_points(request: RunRequest) -> Affordable:
+    """Points that may be chosen, from fast to fine; none where no time and no error is asked for.
+
+    Raises ValueError where not even the fastest fits into the time, or an error is asked for and no camera held out.
+    """
+    if request.max_minutes is None and request.target_psnr is None:
+        return ()
+    capture = find_sequence(request)
+    plan = plan_of(request, capture)
+    return affordable(
+        request,
+        {point: options_of(request, capture, point) for point in up_to(request.preset)},
+        size_of(capture, plan),
+        Machine(cores_of(request), jobs_at_once(request)),
+    )
+
+
+def options_of(request: RunRequest, capture: Capture, point: str) -> SequenceOptions:
+    """Of a run with the settings of this point of the ladder."""
+    return compose(point, capture.settings, request.settings, seed=request.seed, quality=request.quality)
+
+
+def settle(sequence: Sequence, run: Run, engine: Engine, affordable: Affordable) -> tuple[Sequence, Run]:
+    """The run at the point that reaches the error asked for, as pilots of the first frames tell."""
+    target = run.request.target_psnr
+    if target is None:
+        return sequence, run
+    tried: dict[str, float] = {}
+
+    def prepared(point: Priced) -> tuple[Sequence, Run]:
+        return prepare(run.request, run.journal, engine, run.workshop.jobs, (point,))
+
+    for point in affordable:
+        pilot, _ = prepared(point)
+        scores = pilot.workshop.path(pilot.pilot(PILOT_FRAMES)) / METRICS
+        tried[point.name] = json.loads(scores.read_text())["mean"]["psnr_calibrated_db"]
+        run.journal.told(
+            "pilot", f"{point.name}: {tried[point.name]:.2f} dB in the first frames, {target:g} are asked for"
+        )
+        if tried[point.name] >= target:
+            break
+    best = max(tried, key=lambda name: (tried[name] >= target, tried[name]))
+    sequence, chosen = prepared(next(point for point in affordable if point.name == best))
+    assert chosen.choice is not None
+    spent = sum(point.pilot_minutes for point in affordable if point.name in tried)
+    minutes = chosen.choice.forecast_minutes + spent
+    choice = replace(chosen.choice, pilots=tried, forecast_minutes=minutes)
+    return sequence, replace(chosen, choice=choice, started=run.started)
+
+
+def prepare(
+    request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs, affordable: Affordable = ()
+) -> tuple[Sequence, Run]:
+    """The stages of a run, and what it leaves; its folder is there and belongs to the capture.
+
+    Of the points that may be chosen it takes the finest, and the preset where there are none.
+    """
     started = datetime.now(UTC)
     capture = find_sequence(request)
-    options = compose(request.preset, capture.settings, request.settings, seed=request.seed, quality=request.quality)
+    choice = chosen_of(request, affordable[-1]) if affordable else None
+    options = options_of(request, capture, choice.point if choice else request.preset)
     plan = plan_of(request, capture)
     options = replace(options, fit=replace(options.fit, device=plan.device))
     folder = Path(request.out) / capture.name
@@ -183,7 +256,7 @@ def prepare(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
     lender = lender_of(request, capture, workshop, engine.submitter)
     sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), lender, engine.watched)
-    return sequence, Run(folder.name, request, options, plan, workshop, journal, started, sequence.made)
+    return sequence, Run(folder.name, request, options, plan, workshop, journal, started, sequence.made, choice)
 
 
 def find_sequence(request: RunRequest) -> Capture:
@@ -235,7 +308,7 @@ def _publish(run: Run, folder: Path) -> Outcome:
     report = write_report(content, folder)
     run.journal.ended("report")
     events, found = tuple(run.journal.events), findings(content)
-    return Outcome(folder, scene, report.page, summary(content), events, found)
+    return Outcome(folder, scene, report.page, summary(content), events, found, content.choice)
 
 
 def place(source: Path, target: Path) -> None:

@@ -21,6 +21,8 @@ QUALITIES = get_args(Fidelity)
 """How near the scene file stays to the fit, see `packuv.scene.encoder.TOLERANCES`"""
 STAGES = get_args(LastStage)
 """In the order in which a run does them"""
+MOST_DB = 99
+"""Pictures of eight bits that differ at all differ by more"""
 BAD_INPUT = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 """What is raised where the user has to change something, not we"""
 FORM: dict[str, Any] = {"use_attribute_docstrings": True, "extra": "forbid"}
@@ -57,6 +59,10 @@ class RunRequest:
     """Same seed, same bytes"""
     jobs: int | None = None
     """Segments at once; none: from the number of cores"""
+    max_minutes: float | None = None
+    """Take the finest settings up to `preset` that are forecast to take no longer, see docs/pareto.md"""
+    target_psnr: float | None = None
+    """Take the fastest settings up to `preset` whose first frames have so many dB on cameras that are held out"""
     cores: int | None = None
     """To keep busy; none: all. The results do not depend on it where `jobs` is set"""
     memory_gb: float = 2.0
@@ -75,6 +81,12 @@ class RunRequest:
             if (count := getattr(self, name)) is not None and count < 1:
                 raise ValueError(f"{name} must be at least 1, but is {count}")
         check_memory(self.memory_gb)
+        if self.max_minutes is not None and not 0 < self.max_minutes < math.inf:
+            raise ValueError(f"max_minutes must be more than 0, but is {self.max_minutes}")
+        if self.target_psnr is not None and not 0 < self.target_psnr < MOST_DB:
+            raise ValueError(f"target_psnr must lie between 0 and {MOST_DB} dB, but is {self.target_psnr}")
+        if self.target_psnr is not None and STAGES.index(self.stop_after) < STAGES.index("evaluate"):
+            raise ValueError(f"target_psnr needs the scores, but the run stops after {self.stop_after}")
         parse_range(self.frames)
 
     @property

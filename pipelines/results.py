@@ -6,7 +6,7 @@ import json
 import shlex
 import socket
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,12 +30,15 @@ from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
 from tasks.report.facts import (
+    Choice,
     Comparison,
+    FrameScore,
     LightCurve,
     MotionCurve,
     ReportInput,
     SceneFigures,
     StageRecord,
+    by_camera,
     scene_figures,
 )
 from tasks.report.write import JSON_NAME, PAGE_NAME
@@ -66,6 +69,7 @@ class Run:
     journal: Journal
     started: datetime
     made: Made
+    choice: Choice | None = None
 
     def folder(self, stage: str) -> Path | None:
         """Folder of the first artefact of a stage, or None if the run did not come to it."""
@@ -104,6 +108,7 @@ def run_json(run: Run, ending: Ending) -> dict[str, Any]:
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "request": plain(run.request),
         "options": plain(run.options),
+        "choice": plain(run.choice),
         "cameras": {"fitted": run.plan.fitted, "held_out": run.plan.held_out},
         "stages": [event.to_json() for event in events],
         "skipped": [{"what": event.label, "why": event.reason} for event in events if event.outcome == "skipped"],
@@ -116,6 +121,7 @@ def _artefact(store: Store, key: Any) -> dict[str, Any]:
     return {
         "artefact": str(key),
         "seconds": receipt.seconds,
+        "cpu_seconds": receipt.cpu_seconds,
         "peak_memory_bytes": receipt.peak_memory_bytes,
         "bytes": receipt.size_bytes,
         "finished": receipt.finished,
@@ -132,7 +138,8 @@ def check_whole(folder: Path) -> None:
 
 def collect(run: Run) -> ReportInput:
     """What the stages left, for the report; parts that the run did not come to are missing."""
-    now = datetime.now(UTC)
+    now, scores = datetime.now(UTC), _scores(run.folder("evaluate"))
+    seconds = (now - run.started).total_seconds()
     rig_folder, sync_folder = run.folder("points") or run.folder("rig"), run.folder("sync")
     return ReportInput(
         name=run.name,
@@ -141,7 +148,7 @@ def collect(run: Run) -> ReportInput:
         versions={"packuv": packuv.__version__, "python": sys.version.split()[0]},
         host=f"{socket.gethostname()}, {run.workshop.jobs.threads} threads a job, {run.plan.device}",
         finished=now.isoformat(timespec="seconds"),
-        seconds=(now - run.started).total_seconds(),
+        seconds=seconds,
         sync=SyncReport.load(sync_folder) if sync_folder else None,
         rig=Rig.load(rig_folder / RIG) if rig_folder else None,
         held_out=run.plan.held_out,
@@ -151,11 +158,18 @@ def collect(run: Run) -> ReportInput:
         log_like=tuple(_points_notes(run).get("log_like", ())),
         light=_light(run.folder("light")),
         motion=_curve(run.folder("keyframes")),
-        scores=_scores(run.folder("evaluate")),
+        scores=scores,
         scene=_scene(run),
         pictures=tuple(_pictures(run.folder("evaluate"))),
         stages=tuple(_stage(run.workshop.store, event) for event in run.journal.events),
+        choice=run.choice and replace(run.choice, minutes=seconds / 60, psnr_db=_level(scores)),
     )
+
+
+def _level(scores: Sequence[FrameScore]) -> float | None:
+    """Mean PSNR over cameras first, then over frames, calibrated, dB."""
+    cameras = by_camera(scores).values()
+    return float(np.mean([np.mean([score.level_db for score in own]) for own in cameras])) if cameras else None
 
 
 def _check(run: Run) -> RigReport | None:
@@ -183,7 +197,7 @@ def _curve(folder: Path | None) -> MotionCurve | None:
     return MotionCurve(np.array(read_curve(folder)), tuple(read_keyframes(folder))) if folder else None
 
 
-def _scores(folder: Path | None) -> tuple[Any, ...]:
+def _scores(folder: Path | None) -> tuple[FrameScore, ...]:
     return frame_scores(read_table(folder / TABLE)) if folder else ()
 
 

@@ -24,7 +24,7 @@ from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig
 from tasks.stages.encode import Encode, Verify
 from tasks.stages.evaluate import Evaluate, scored_cameras
 from tasks.stages.fitting import FitBackdrop, background_of, count_pictures, lacks_backdrop
-from tasks.stages.footage import Take
+from tasks.stages.footage import PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
@@ -85,6 +85,17 @@ class Sequence:
         for stage in STAGES[: STAGES.index(stop_after) + 1]:
             if stage != "report":  # which is written of whatever there is
                 steps[stage]()
+
+    def pilot(self, frames: int) -> Key:
+        """Scores of the first frames alone, on the cameras that are held out; what is made for them beside these frames
+        is what a whole run needs. For a sequence of its own, whose `made` then has no more than that."""
+        self.run("flow")
+        spans = self._spans()
+        first = range(spans[0].start, min(spans[0].stop, spans[0].start + frames))
+        self.made.add(*self._chain(spans).pilot(first))
+        scene = self.encoded()
+        self._make(replace(scene, take=replace(scene.take, stop=self.plan.first + first.stop)))
+        return self.score(self.plan.held_out, self.options.pictures)
 
     def encoded(self) -> Encode:
         """The scene file of the segments that are there."""
@@ -148,19 +159,22 @@ class Sequence:
         self._make(ChooseKeyframes(motion=motion, options=self.options.keyframes))
 
     def _fit(self) -> None:
-        take, options, spans = self._take("points"), self.options, self._spans()
-        told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
-        background = self._background(take)
-        backdrop = self._backdrop(told, background, spans)
-        motion = self.made.only("motion")
-        chain = Chain(self.workshop, self.plan, options, self.submit, told, background, backdrop, motion)
+        spans = self._spans()
         previews = []
-        for number, (key, segment) in enumerate(chain.fit(spans), start=1):
+        for number, (key, segment) in enumerate(self._chain(spans).fit(spans), start=1):
             self.made.add(key, segment)
             if self.watched:
                 previews.append(self.submit(self._preview(key, segment, number)))
         for preview in previews:
             self.made.add(preview.result())
+
+    def _chain(self, spans: list[range]) -> Chain:
+        take = self._take("points")
+        told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
+        background = self._background(take)
+        backdrop = self._backdrop(told, background, spans)
+        motion = self.made.only("motion")
+        return Chain(self.workshop, self.plan, self.options, self.submit, told, background, backdrop, motion)
 
     def _background(self, take: Take) -> Key | None:
         options = self.options.fit.background
@@ -197,8 +211,12 @@ class Sequence:
         if not self.plan.held_out:
             why = f"no camera is held out; scored on fitted {', '.join(cameras)}"
             self.workshop.listener.skipped("unseen scores", why)
-        take = replace(self._take("points"), cameras=cameras, stop=None)
-        self._make(self._evaluation(take))
+        self.score(cameras, self.options.pictures)
+
+    def score(self, cameras: tuple[str, ...], pictures: PictureOptions) -> Key:
+        """Scores of the scene on these cameras, against pictures of this size; noted in `made`, as in a run."""
+        take = replace(self._take("points"), cameras=cameras, pictures=pictures, stop=None)
+        return self._make(self._evaluation(take))
 
     def _evaluation(self, take: Take) -> Evaluate:
         """With LPIPS, where the file of weights and the package for it are there."""

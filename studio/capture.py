@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from studio.clocks import EPOCH_NS, SECOND_NS, CameraTimes, ClockOptions, record, tick_times, timecode_lines
-from studio.film_set import FilmSet, build_set
+from studio.film_set import CROWD, MOVING, FilmSet, build_set
 from studio.light import LightOptions, draw_shading, exposure_over_time, light_over_time
 from studio.raycast import cast, follow, look_once, render
 from studio.rig import PlacementOptions, StudioCamera, place_cameras
@@ -84,6 +84,10 @@ class SimulateOptions:
     light: LightOptions = field(default_factory=LightOptions)
     entrance_share: float = 0.3
     """The door opens after this share of the capture, but after six seconds at the latest"""
+    movers: tuple[str, ...] = MOVING
+    """Which of the things that can move do; the others stand as at the start. None at all: a still scene"""
+    crowd: int = 0
+    """Persons who walk round beside the walker, all over the room: with 27 most of a picture moves"""
     truth: TruthKind = TruthKind.FULL
     calibration: CalibrationKind = CalibrationKind.GIVEN
     held_out: int | None = None
@@ -111,6 +115,10 @@ class SimulateOptions:
             )
         if not re.fullmatch(r"[\w.-]+", self.name):
             raise ValueError(f"the name must consist of letters, digits, '.', '_' and '-', but is {self.name!r}")
+        if unknown := [name for name in self.movers if name not in MOVING]:
+            raise ValueError(f"movers must be among {', '.join(MOVING)}, but has {', '.join(unknown)}")
+        if not 0 <= self.crowd <= sum(CROWD):
+            raise ValueError(f"a crowd has 0 to {sum(CROWD)} persons, but is {self.crowd}")
         self._check_size()
 
     @property
@@ -229,7 +237,14 @@ def _film_all(
     report = progress or (lambda done, total: None)
     done, total = 0, sum(len(recording.times.ticks) for recording in recordings)
     report(done, total)
-    film_set = build_set(options.seed, entrance_s, shine=options.light.shine, wall_lamps=options.light.wall_lamps)
+    film_set = build_set(
+        options.seed,
+        entrance_s,
+        shine=options.light.shine,
+        wall_lamps=options.light.wall_lamps,
+        moving=options.movers,
+        crowd=options.crowd,
+    )
     for recording in recordings:
         for _ in film(folder, film_set, light, recording, options):
             done += 1

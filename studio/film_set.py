@@ -39,6 +39,8 @@ GRAVITY = 9.81
 
 WALK_CENTRE, WALK_RADIUS, WALK_SPEED = (0.15, -0.30), 0.85, 0.95
 """The walker's circle, metres and metres per second"""
+CROWD, CROWD_RADII_M = (6, 9, 12), (1.3, 1.75, 2.15)
+"""Persons of a crowd on circles about the same middle, and the circles' radii"""
 DOOR_TRAVEL, DOOR_SECONDS = 1.06, 0.7
 VISITOR_FROM, VISITOR_TO, VISITOR_SPEED = 4.62, 1.75, 1.05
 """y of the visitor's way in along x = VISITOR_X, and how fast"""
@@ -64,11 +66,19 @@ class FilmSet:
     light: Light
     colours: Paints
     textures: Textures
+    moving: tuple[str, ...] = MOVING
+    """Those of MOVING that do; the others stand as at the start"""
+    crowd: int = 0
+    """Persons who walk round beside the walker, and whose shapes count as the walker's"""
 
     def at(self, seconds: float) -> Moment:
         """What moves, `seconds` after the start of the capture."""
         parts = Parts(self.textures)
-        blockers = [add(parts, OBJECTS.index(name), self, seconds) for name, add in MOVERS.items()]
+        blockers = [
+            add(parts, OBJECTS.index(name), self, seconds if name in self.moving else 0.0)
+            for name, add in MOVERS.items()
+        ]
+        blockers += [_add_walker_of_crowd(parts, number, seconds) for number in range(self.crowd)]
         return Moment(parts.shapes(), np.concatenate(blockers))
 
     def clear_of(self, point: np.ndarray) -> float:
@@ -79,7 +89,15 @@ class FilmSet:
 
 
 @lru_cache(maxsize=2)
-def build_set(seed: int, entrance_s: float, *, shine: float = 0.0, wall_lamps: float = 0.0) -> FilmSet:
+def build_set(
+    seed: int,
+    entrance_s: float,
+    *,
+    shine: float = 0.0,
+    wall_lamps: float = 0.0,
+    moving: tuple[str, ...] = MOVING,
+    crowd: int = 0,
+) -> FilmSet:
     """Paint and furnish the room; takes some seconds, and is remembered. `LightOptions` has shine and wall lamps."""
     textures = _textures(seed)
     parts = Parts(textures)
@@ -89,7 +107,7 @@ def build_set(seed: int, entrance_s: float, *, shine: float = 0.0, wall_lamps: f
     if wall_lamps > 0:
         add_wall_lamps(parts, owners["lamp"], wall_lamps)
     standing = parts.shapes()
-    return FilmSet(entrance_s, standing, _light(standing), paints(textures), textures)
+    return FilmSet(entrance_s, standing, _light(standing), paints(textures), textures, moving, crowd)
 
 
 def _light(standing: Shapes) -> Light:
@@ -120,6 +138,19 @@ def _add_walker(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> 
     clothes = Clothes("shirt", (1.0, 1.0, 1.0), (1.0, 0.96, 0.92), (1.0, 1.0, 1.0), (0.75, 0.12, 0.10))
     pose = Pose(place, angle + np.pi / 2, 2 * np.pi * way / STRIDE_M, 0.85, gaze_rad=0.35 * np.sin(0.9 * seconds))
     return add_figure(parts, owner, clothes, pose)
+
+
+def _add_walker_of_crowd(parts: Parts, number: int, seconds: float) -> np.ndarray:
+    """One of a crowd: on circles about the walker's, filled from the inner one on, all persons evenly apart."""
+    ring = next(ring for ring in range(len(CROWD)) if number < sum(CROWD[: ring + 1]))
+    place_in_ring, radius = number - sum(CROWD[:ring]), CROWD_RADII_M[ring]
+    way = WALK_SPEED * seconds
+    angle = 0.7 + 2 * np.pi * place_in_ring / CROWD[ring] + way / radius
+    place = (WALK_CENTRE[0] + radius * np.cos(angle), WALK_CENTRE[1] + radius * np.sin(angle))
+    tint = 0.4 + 0.6 * np.modf(0.618 * (number + 1) * np.arange(1, 4))[0]
+    clothes = Clothes(("shirt", "plaid")[number % 2], tuple(tint), (1.0, 0.96, 0.92), (1.0, 1.0, 1.0), (0.3, 0.3, 0.3))
+    phase = 2 * np.pi * (way / STRIDE_M + 0.37 * number)
+    return add_figure(parts, OBJECTS.index("walker"), clothes, Pose(place, angle + np.pi / 2, phase, 0.85))
 
 
 def _add_visitor(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:

@@ -32,6 +32,10 @@ class BatchRequest:
     """Single settings, which win over the preset: {"fit": {"iterations": 3000}}"""
     frames: str = ":"
     """Instants A:B of each sequence, from A up to B - 1, counted from 0; either end may be missing"""
+    max_minutes: float | None = None
+    """For each sequence, the finest settings up to `preset` that are forecast to take no longer"""
+    target_psnr: float | None = None
+    """For each sequence, the fastest settings up to `preset` whose first frames have so many dB on unseen cameras"""
     device: Device = "auto"
     """What fits and renders"""
     seed: int = 0
@@ -69,6 +73,8 @@ class BatchRequest:
             seed=self.seed,
             jobs=self.jobs,
             memory_gb=self.memory_gb,
+            max_minutes=self.max_minutes,
+            target_psnr=self.target_psnr,
         )
 
     @property

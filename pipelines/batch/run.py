@@ -342,7 +342,7 @@ def _ended(step: Step, error: Exception) -> Result:
 def _finished(step: Step, outcome: Outcome) -> Result:
     figures, size = outcome.figures, outcome.figures["mb_per_30_frames"]
     return replace(
-        _row(step, Status.FINISHED),
+        _row(step, Status.FAILED, outcome.missed) if outcome.missed else _row(step, Status.FINISHED),
         psnr_db=figures["psnr_db"],
         ssim=figures["ssim"],
         unseen=bool(figures["held_out"]) and figures["psnr_db"] is not None,

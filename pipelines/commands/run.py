@@ -13,13 +13,17 @@ from typing import TYPE_CHECKING, Any
 from pipelines.commands.output import answer
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
-from pipelines.request import STAGES, RunRequest, read_settings
+from pipelines.request import PRESETS, STAGES, RunRequest, read_settings
 from pipelines.server import brings_server, workflow_server
 from sync.capture import CaptureSettings
 from tasks.artefacts.recipe import plain
 
 if TYPE_CHECKING:
     from pipelines.process import Outcome
+
+
+MISSED = 1
+"""Exit code of a run that is whole, but does not reach the error that was asked for"""
 
 
 def command(arguments: argparse.Namespace) -> int:
@@ -33,7 +37,7 @@ def command(arguments: argparse.Namespace) -> int:
 
         check_whole(outcome.folder)
     answer(json.dumps(outcome.to_json(), indent=1)) if arguments.json else print(outcome.farewell())
-    return 0
+    return MISSED if outcome.missed else 0
 
 
 def request_from(arguments: argparse.Namespace) -> RunRequest:
@@ -51,8 +55,12 @@ def request_from(arguments: argparse.Namespace) -> RunRequest:
 
 def asked_for(arguments: argparse.Namespace) -> dict[str, Any]:
     """How to process, be it one sequence or many: fields that both requests have."""
-    named = {name: getattr(arguments, name) for name in ("preset", "quality", "frames", "device", "seed", "memory_gb")}
-    return {**named, "settings": read_settings(arguments.config, arguments.set)}
+    names = ("quality", "frames", "device", "seed", "memory_gb", "max_minutes", "target_psnr")
+    named = {name: getattr(arguments, name) for name in names}
+    chosen = arguments.max_minutes is not None or arguments.target_psnr is not None
+    # Who names a time or an error, and no preset, sets no bound.
+    preset = arguments.preset or (PRESETS[-1] if chosen else RunRequest.preset)
+    return {**named, "preset": preset, "settings": read_settings(arguments.config, arguments.set)}
 
 
 def run(request: RunRequest, journal: Journal, *, direct: bool) -> Outcome:

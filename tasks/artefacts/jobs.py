@@ -74,6 +74,8 @@ class Done:
     value: Any
     """What it returned, as plain values"""
     peak_memory_bytes: int
+    cpu_seconds: float
+    """Of all its threads, and of the processes that it started and waited for"""
     cpu: str
     """Processor and instructions, see `packuv.kernels.simd.cpu_description`"""
 
@@ -176,7 +178,7 @@ class Jobs:
             if isinstance(raised, JobError) or (type(raised) is OSError and not raised.errno):
                 _blame_disk(log.parent)
             raise raised
-        return Done(last["result"], last["peak_memory_bytes"], last["cpu"])
+        return Done(last["result"], last["peak_memory_bytes"], last["cpu_seconds"], last["cpu"])
 
 
 def _follow(messages: Any, progress: Progress) -> dict[str, Any] | None:
@@ -274,6 +276,7 @@ def _result(job: Path, progress: Progress) -> dict[str, Any]:
         return {
             "result": plain(value, where="result"),
             "peak_memory_bytes": peak_memory_bytes(),
+            "cpu_seconds": round(sum(os.times()[:4]), 3),  # own and children's, in the program and in the system
             "cpu": cpu_description(),
         }
     except Exception as error:

@@ -80,6 +80,8 @@ class Receipt:
     """What the stage said about its work"""
     cpu: str = ""
     """Processor and the instructions that kernels were compiled for; results agree to the bit where these are equal"""
+    cpu_seconds: float | None = None
+    """Of all threads and processes of the attempt that succeeded; None: nobody measured it"""
 
     @property
     def size_bytes(self) -> int:
@@ -100,7 +102,8 @@ class Damage:
 
 
 Build = Callable[[Building], Mapping[str, Any] | None]
-"""Fills `building.out`; returns notes for the receipt, where `peak_memory_bytes` and `cpu` have places of their own"""
+"""Fills `building.out`; returns notes for the receipt, where `peak_memory_bytes`, `cpu_seconds` and `cpu` have
+places of their own"""
 
 Originals = Callable[[], Mapping[str, Any]]
 """What a build reads beside artefacts: by name, something that moves when it does. Raises ValueError if one is not what
@@ -323,6 +326,7 @@ def _attempt(place: Path, build: Build, lock: int) -> None:
         "seconds": round(time.monotonic() - start, 3),
         "peak_memory_bytes": int(notes.pop("peak_memory_bytes", 0) or peak_memory_bytes()),
         "cpu": notes.pop("cpu", ""),
+        "cpu_seconds": notes.pop("cpu_seconds", None),
         "notes": notes,
     }
     _flush_all(out)

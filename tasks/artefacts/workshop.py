@@ -100,4 +100,9 @@ class Workshop:
             keep_open=[building.lock],
         )
         notes: Notes = done.value or {}
-        return {**notes, "peak_memory_bytes": done.peak_memory_bytes, "cpu": done.cpu}
+        return {
+            **notes,
+            "peak_memory_bytes": done.peak_memory_bytes,
+            "cpu_seconds": done.cpu_seconds,
+            "cpu": done.cpu,
+        }

@@ -180,6 +180,51 @@ class SceneFigures:
 
 
 @dataclass(frozen=True)
+class Choice:
+    """Which point of the curve of run time against error a run took, and why: what was forecast, and what came."""
+
+    point: str
+    """Of `pipelines.ladder.LADDER`"""
+    forecast_minutes: float
+    """Of the whole run, pilots included, had nothing been there"""
+    max_minutes: float | None = None
+    target_psnr: float | None = None
+    pilots: Mapping[str, float] = field(default_factory=dict)
+    """By point tried, PSNR of the first frames on unseen cameras, calibrated, dB"""
+    minutes: float | None = None
+    """That the run took, without what was there before"""
+    psnr_db: float | None = None
+    """Of all frames"""
+
+    @property
+    def missed(self) -> str:
+        """By how much the target is missed; empty where it is reached, or none was set."""
+        if self.target_psnr is None or self.psnr_db is None or self.psnr_db >= self.target_psnr:
+            return ""
+        tried = ", ".join(f"{point} {level:.2f}" for point, level in self.pilots.items())
+        return (
+            f"The target of {self.target_psnr:g} dB is missed: {self.point} reaches {self.psnr_db:.2f} dB "
+            f"(first frames, dB: {tried})."
+        )
+
+    @property
+    def late(self) -> str:
+        """By how much the run took longer than it was to."""
+        if self.max_minutes is None or self.minutes is None or self.minutes <= self.max_minutes:
+            return ""
+        return (
+            f"The run took {self.minutes:.1f} minutes, but was to take {self.max_minutes:g} at most; "
+            f"{self.forecast_minutes:.1f} were forecast."
+        )
+
+    @property
+    def told(self) -> str:
+        """For people, in one line."""
+        took = "" if self.minutes is None else f", took {self.minutes:.1f}"
+        return f"{self.point}: {self.forecast_minutes:.1f} minutes forecast{took}"
+
+
+@dataclass(frozen=True)
 class ReportInput:
     """All that a report may show; leave out what there is not."""
 
@@ -215,6 +260,8 @@ class ReportInput:
     scene: SceneFigures | None = None
     pictures: tuple[Comparison, ...] = ()
     stages: tuple[StageRecord, ...] = ()
+    choice: Choice | None = None
+    """Where the user named a time or an error instead of a preset"""
 
 
 def scene_figures(scene: Scene, *, verified: bool | None = None, problem: str = "") -> SceneFigures:

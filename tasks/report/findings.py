@@ -70,6 +70,8 @@ def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...
 
 
 def _run_findings(report: ReportInput) -> Iterator[Finding]:
+    if report.choice:
+        yield from (Finding("run", text) for text in (report.choice.missed, report.choice.late) if text)
     for stage in report.stages:
         if stage.outcome is StageOutcome.FAILED:
             yield Finding("stages", f"The stage {stage.label!r} failed: {stage.reason or 'no reason was given'}.")

@@ -28,6 +28,7 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
             "host": report.host,
             "finished": report.finished,
             "seconds": report.seconds,
+            "choice": report.choice and plain(report.choice),
         },
         "summary": summary(report),
         "findings": [plain(finding) for finding in findings(report, limits)],

@@ -369,6 +369,7 @@ def _run(report: ReportInput) -> Body:
         return "Neither the command nor the options were recorded."
     return {
         "command": report.command,
+        "choice": report.choice,
         "versions": "\n".join(f"{name:<18} {version}" for name, version in report.versions.items()),
         "options": "" if report.options is None else json.dumps(plain(report.options), indent=1),
     }

@@ -127,6 +127,7 @@ def test_arguments_results_and_progress_cross_over(jobs, work, tmp_path):
     assert done.value["threads"] == {"NUMBA_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "1"}
     assert done.value["pid"] != os.getpid()
     assert done.peak_memory_bytes > 1 << 20
+    assert done.cpu_seconds > 0
     assert done.cpu.endswith(" lanes")
 
 
