@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from packuv.camera import PinholeCamera
 from packuv.files import save_json, save_npz
 from packuv.fit.backdrop import Backdrop, joined
 from packuv.fit.losses import photometric_loss
@@ -115,7 +116,7 @@ def fit_backdrop(
     """
     if len(stills) < 2:
         raise ValueError(f"a backdrop needs what stands still in two cameras, but is given {len(stills)}")
-    shots = [_still_shot(views, still) for still in stills]
+    shots = [still_shot(views, still) for still in stills]
     room = replace(options.density, cap=round(options.backdrop_share * options.density.cap))
     state = _fit_all(views, shots, None, points, replace(options, density=room), progress)
     drawn = state.quantizer.encode(state.gaussians).attributes[:, OPACITY] > DEAD_CODE
@@ -163,7 +164,7 @@ def _fit_all(
     model.limit_sh(degree)
     solver.fix(choose_quantizer(model.gaussians, bounds, degree))
     losses = solver.run(shots, total - floating, of=total, ticks=ticks)
-    return KeyState(instant, model.gaussians, 0, solver.known_quantizer, bounds, _figures(started, losses, solver))
+    return KeyState(instant, model.gaussians, 0, solver.known_quantizer, bounds, figures_of(started, losses, solver))
 
 
 def fit_next(
@@ -193,23 +194,23 @@ def fit_next(
     masks = standing if previous.instant is None else _changes(views, previous.instant, instant, motion)
     shots = find_shots(views, instant, masks)
     if not shots:
-        return replace(previous, instant=instant, figures=_figures(started, {}, solver))
+        return replace(previous, instant=instant, figures=figures_of(started, {}, solver))
     if previous.instant is not None:
         before = _standing(views, previous.instant, stills, motion)
-        gone = _inside(model.gaussians, views, before, bounds, options)
-        solver.keep(~gone | _inside(model.gaussians, views, standing, bounds, options))
+        gone = inside(model.gaussians, views, before, bounds, options)
+        solver.keep(~gone | inside(model.gaussians, views, standing, bounds, options))
     solver.free(moving_rows(model.gaussians, quantizer, views, masks, bounds, options))
     solver.make_room(shots)
     seen = [mask if alone is None else alone for alone, mask in zip(standing, masks, strict=True)]
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
     if not solver.rows.any():  # nothing that enough cameras see
-        figures = _figures(started, {}, solver)
+        figures = figures_of(started, {}, solver)
         return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
     losses = solver.run(shots, options.key_iterations, of=options.key_iterations, grow_from=len(model),
                       ticks=Ticks(progress, options.key_iterations))  # fmt: skip
     solver.keep(~solver.rows | solver.worth_keeping())
-    figures = _figures(started, losses, solver)
+    figures = figures_of(started, losses, solver)
     return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
 
 
@@ -222,7 +223,8 @@ def _changes(views: Views, first: int, last: int, motion: MotionOptions) -> list
     return [changed_between(views, camera, first, last, motion) for camera in range(len(views.cameras))]
 
 
-def _still_shot(views: Views, still: Still) -> Shot:
+def still_shot(views: Views, still: Still) -> Shot:
+    """What stands still in a camera, as a picture to explain."""
     response = views.response(still.camera, None)
     return Shot(views.cameras[still.camera], as_planes(still.pixels), response, known=still.known)
 
@@ -238,7 +240,7 @@ def _standing(views: Views, instant: int, stills: Sequence[Still], motion: Motio
     return masks
 
 
-def _inside(
+def inside(
     gaussians: Gaussians,
     views: Views,
     masks: Sequence[np.ndarray | None],
@@ -317,15 +319,29 @@ def _hull_gaussians(
     """New Gaussians inside the hull of the masks: what moved there since the last keyframe has none yet."""
     found = [(camera, views.picture(i, instant), masks[i]) for i, camera in enumerate(views.cameras)]
     seeing = [(camera, picture, mask) for camera, picture, mask in found if picture is not None and mask is not None]
+    return born_in_hull(seeing, bounds, options, rng, sh_degree, options.key_births)
+
+
+def born_in_hull(
+    seeing: Sequence[tuple[PinholeCamera, np.ndarray, np.ndarray]],
+    bounds: Bounds,
+    options: KeyframeOptions,
+    rng: np.random.Generator,
+    sh_degree: int,
+    count: int,
+) -> Gaussians:
+    """At most `count` Gaussians in the hull of masks; of each camera its picture in the rig's colours, float32
+    [3, H, W], and its mask, bool [H, W]."""
     points = hull_points([s[0] for s in seeing], [s[1] for s in seeing], [s[2] for s in seeing], bounds=bounds,
-                         options=options.start, count=options.key_births, rng=rng)  # fmt: skip
+                         options=options.start, count=count, rng=rng)  # fmt: skip
     spacing = neighbour_distance(points.xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 0.02 * bounds.radius)
     born = round_gaussians(points.xyz, points.rgb, scale, opacity=options.start.opacity, sh_degree=sh_degree)
     return with_canonical_axes(born)
 
 
-def _figures(started: float, losses: Losses, solver: Solver) -> dict[str, Any]:
+def figures_of(started: float, losses: Losses, solver: Solver) -> dict[str, Any]:
+    """What a fit that began at `started`, monotonic seconds, measured."""
     return {
         "seconds": time.monotonic() - started,
         "loss": sum(losses.values()),

@@ -7,7 +7,7 @@ it first paints no head onto the wall behind it, and has the wall that a step as
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,10 +48,18 @@ class Still:
 
 
 def find_background(
-    views: Views, options: BackgroundOptions, progress: Progress = no_progress, *, least: int = 3
+    views: Views,
+    options: BackgroundOptions,
+    progress: Progress = no_progress,
+    *,
+    least: int = 3,
+    among: range | None = None,
 ) -> list[Still]:
-    """Backgrounds of the cameras that filmed at least `least` of the chosen instants; an empty stage needs one."""
-    instants = np.unique(np.linspace(0, len(views) - 1, min(options.instants, len(views))).round().astype(int))
+    """Backgrounds of the cameras that filmed at least `least` of the instants chosen `among` some, by default all; an
+    empty stage needs one."""
+    among = range(len(views)) if among is None else among
+    count = min(options.instants, len(among))
+    instants = np.unique(np.linspace(among.start, among.stop - 1, count).round().astype(int))
     stills = []
     for camera in range(len(views.cameras)):
         pictures = [views.steady(camera, int(instant), remember=False) for instant in instants]
@@ -60,6 +68,12 @@ def find_background(
             stills.append(_still(camera, np.stack(found), options))
         progress(camera + 1, len(views.cameras))
     return stills
+
+
+def patched(usual: Still, own: Still, places: np.ndarray) -> Still:
+    """A background with another one, of the same camera, in some places, bool [H, W]."""
+    pixels = np.where(places[:, :, None], own.pixels, usual.pixels)
+    return replace(usual, pixels=pixels, known=np.where(places, own.known, usual.known))
 
 
 def save_stills(path: Path, stills: Sequence[Still]) -> None:

@@ -16,6 +16,7 @@ from packuv.files import save_json
 from packuv.fit.frames import fit_segment
 from packuv.fit.keyframe import KeyState, enough_stands_still, fit_backdrop, fit_first, fit_next
 from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
+from packuv.fit.patch import fit_patch, whole_places
 from packuv.fit.seam import seam, tail
 from packuv.fit.start.points import Points
 from packuv.gaussians.rows import hold_absent
@@ -27,8 +28,10 @@ from packuv.motion import (
     Plate,
     Still,
     compare_plate,
+    epochs,
     find_background,
     load_stills,
+    patched,
     save_stills,
 )
 from sync.align import FrameGroups
@@ -40,7 +43,7 @@ from tasks.stages.calibrate import POINTS
 from tasks.stages.footage import Footage, Take
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import selected
-from tasks.stages.track import MOTION
+from tasks.stages.track import MOTION, read_patches
 
 SEGMENT, FIGURES, STILLS, SEAM = "segment.npz", "fit.json", "stills.npz", "seam.json"
 PLATES, REFUSED = "plates.json", "refused"
@@ -116,6 +119,67 @@ class FitBackdrop(Stage):
             Footage(self.take, work.site).open_views(),
             _stills(work, self.background),
             points=_points(work, self.take),
+            options=self.options,
+            progress=work.progress,
+        )
+        state.save(work.out)
+        return dict(state.figures)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchBackground(Stage):
+    """What stands still between two dates: that of the whole sequence, but where something changes for good the median
+    of these instants: stills.npz."""
+
+    name, version = "background", 1
+    take: Take
+    background: Key
+    patches: Key
+    epoch: int
+    """Counted from 0, the time before the first date"""
+    options: BackgroundOptions
+
+    @property
+    def label(self) -> str:
+        return f"background of epoch {self.epoch + 1}"
+
+    def build(self, work: Work) -> Notes:
+        views, found = Footage(self.take, work.site).open_views(), read_patches(work.path(self.patches)).found
+        among = epochs([patch.date for patch in found], len(views))[self.epoch]
+        own = {s.camera: s for s in find_background(views, self.options, work.progress, among=among)}
+        stills = []
+        for usual in _stills(work, self.background):
+            masks = [whole_places(p.masks[usual.camera], views.cameras[usual.camera])
+                     for p in found if usual.camera in p.masks]  # fmt: skip
+            seen = masks and usual.camera in own
+            stills.append(patched(usual, own[usual.camera], np.any(masks, axis=0)) if seen else usual)
+        save_stills(work.out / STILLS, stills)
+        return {"cameras": len(stills), "known_share": float(np.mean([still.known.mean() for still in stills] or [0]))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchBackdrop(Stage):
+    """Fit the backdrop of an epoch from that of one beside it: state.npz and key.json."""
+
+    name, version = "backdrop", 1
+    take: Take
+    previous: Key
+    before: Key
+    """Background of `previous`"""
+    after: Key
+    options: NextOptions
+    epoch: int = field(compare=False)
+
+    @property
+    def label(self) -> str:
+        return f"patch backdrop for epoch {self.epoch + 1}"
+
+    def build(self, work: Work) -> Notes:
+        state = fit_patch(
+            KeyState.load(work.path(self.previous)),
+            Footage(self.take, work.site).open_views(),
+            _stills(work, self.before),
+            _stills(work, self.after),
             options=self.options,
             progress=work.progress,
         )
