@@ -202,7 +202,8 @@ def _small(views: Views, camera: int, instant: int, width: int) -> np.ndarray | 
 def _apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Largest difference of a channel, uint8 [...] of [..., 3]."""
     apart = np.maximum(first, second) - np.minimum(first, second)
-    return np.maximum(np.maximum(apart[..., 0], apart[..., 1]), apart[..., 2])
+    largest: np.ndarray = np.maximum(np.maximum(apart[..., 0], apart[..., 1]), apart[..., 2])
+    return largest
 
 
 def _peaks(score: np.ndarray, reach: int) -> np.ndarray:
@@ -218,20 +219,21 @@ def _clustered(
     seen: Sequence[_Changes], window: int, options: PatchOptions
 ) -> tuple[list[tuple[int, Places, Places]], list[int]]:
     """Splits at which enough cameras change, with the places of each camera there, and those of all splits nearer than
-    `window`, for which the one that most cameras saw stands; and the splits at which the scene is cut."""
-    count = len(seen[0].splits)
-    masks: list[Places] = [
-        {c: mask for c, part in enumerate(seen) if (mask := _region(part, split, window, options)).any()}
-        for split in range(count)
-    ]
-    weight = [(len(part), sum(float(mask.mean()) for mask in part.values())) for part in masks]
-    left = {split for split in range(count) if len(masks[split]) >= options.cameras}
+    `window`, for which the one with most places stands; and the splits at which the scene is cut."""
+    possible = range(window, len(seen[0].splits) - window + 1)
+    masks: dict[int, Places] = {
+        split: {c: mask for c, part in enumerate(seen) if (mask := _region(part, split, window, options)).any()}
+        for split in possible
+    }
+    share = {split: sum(float(mask.mean()) for mask in part.values()) for split, part in masks.items()}
+    exact = {split: sum(int(part.splits[split].sum()) for part in seen) for split in possible}
+    left = {split for split in possible if len(masks[split]) >= options.cameras}
     dated, cuts = [], []
     while left:
-        best = max(left, key=lambda split: (*weight[split], -split))
+        best = max(left, key=lambda split: (exact[split], -split))
         near = sorted(split for split in left if abs(split - best) < window)
         left -= set(near)
-        if weight[best][1] > options.most_area * len(seen):
+        if share[best] > options.most_area * len(seen):
             cuts.append(best)
             continue
         together: Places = {}
@@ -245,7 +247,7 @@ def _clustered(
 def _region(part: _Changes, split: int, window: int, options: PatchOptions) -> np.ndarray:
     """Connected places that differ from before to after a split, bool [h, w], if most of each are as still on either
     side as a thing is: the outline of a person who stands is not."""
-    still = part.splits[max(0, split - 1) : split + 2].any(axis=0)
+    still = np.asarray(part.splits[max(0, split - 1) : split + 2].any(axis=0))
     if not still.any():
         return still
     other = _apart(part.states[split - window], part.states[split]) >= options.contrast
