@@ -160,6 +160,15 @@ def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
     assert redone() == set()  # back to what was there at first
 
 
+def test_without_lasting_change_nothing_depends_on_how_that_was_found(first, capture):
+    outcome, said = first
+    assert "no lasting change found" in said
+    off, said = run(request(capture, outcome.folder.parent, settings={**SETTINGS, "patches": {"enabled": False}}))
+    assert "patches.enabled is false" in said
+    assert made(off) == set()
+    assert artefacts(off).items() == artefacts(outcome).items() - {("patches", artefacts(outcome)["patches"])}
+
+
 def seam_of(outcome: Outcome) -> float:
     """Flicker at the scene's border over that elsewhere, for the camera that was held out."""
     metrics = outcome.folder / "store" / artefacts(outcome)["evaluate"] / "metrics.json"
