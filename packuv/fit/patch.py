@@ -27,6 +27,8 @@ from packuv.progress import Progress, Ticks, no_progress
 
 GROWTH = 0.006
 """Growth of a changed place, share of the picture's width: its edge is blurred, and it was seen in a small picture"""
+DENSITY = 3.0
+"""Gaussians that a patch may bring, over those that the backdrop has for as much of the pictures"""
 TRIALS = 200
 """Points that are sought where the views of a change meet"""
 
@@ -74,14 +76,17 @@ def fit_patch(
         masks[still.camera] = mask if mask.any() else None
     loose = inside(previous.gaussians, views, masks, bounds, options)
     kept = rows_of(previous.gaussians, ~loose)
-    solver = Solver(Model(rows_of(previous.gaussians, loose)), bounds, options, rng,
+    share = float(np.mean([mask.mean() for _, mask in both] or [0]))
+    spare = (options.density.cap - len(previous.gaussians)) // 2  # the rest is for what stands before
+    fresh = max(0, min(spare, round(DENSITY * share * len(previous.gaussians))))
+    density = replace(options.density, cap=len(previous.gaussians) + fresh)
+    solver = Solver(Model(rows_of(previous.gaussians, loose)), bounds, replace(options, density=density), rng,
                     Backdrop(quantizer.decode(quantizer.encode(kept)), bounds.near, options.device))  # fmt: skip
     solver.fix(quantizer)
     shots = [still_shot(views, still) for still, _ in both]
     seeing = [(shot.camera, shot.response.undone(shot.target), mask)
               for shot, (_, mask) in zip(shots, both, strict=True) if mask.any()]  # fmt: skip
-    room = max(0, solver.cap - len(solver.model)) // 2  # the rest is for what stands before
-    births = min(options.key_births, room)
+    births = min(options.key_births, fresh // 2)  # the others where the first ones do not suffice
     solver.append(born_in_hull(seeing, bounds, options, rng, quantizer.sh_degree, births))
     if not len(solver.model):
         return previous
