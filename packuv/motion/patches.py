@@ -131,8 +131,11 @@ def find_patches(views: Views, options: PatchOptions, *, workers: int = 1, progr
             seen.append(part.result())
             progress(done, len(work))
     dated, cuts = _clustered(seen, window, options)
-    found = [Patch(_date(views, instants, seen, s, own, options, window), places) for s, own, places in dated]
-    return Patches(tuple(sorted(found, key=lambda patch: patch.date)), tuple(int(instants[cut]) for cut in cuts))
+    found: dict[int, Places] = {}
+    for split, own, places in dated:
+        found.setdefault(_date(views, instants, seen, split, own, options, window), places)
+    patches = tuple(Patch(date, found[date]) for date in sorted(found))
+    return Patches(patches, tuple(int(instants[cut]) for cut in cuts))
 
 
 @dataclass(frozen=True)

@@ -48,11 +48,12 @@ class DatePatches(Stage):
     def build(self, work: Work) -> Notes:
         views = Footage(self.take, work.site).open_views()
         all_found = find_patches(views, self.options, workers=work.site.threads, progress=work.progress)
-        real = tuple(patch for patch in all_found.found if in_one_place(patch.masks, views.cameras))
+        placed = {patch.date: in_one_place(patch.masks, views.cameras) for patch in all_found.found}
+        real = tuple(patch for patch in all_found.found if placed[patch.date])
         replace(all_found, found=real).save(work.out / PATCHES)
         return {
             "patches": [{"instant": p.date, "cameras": [views.names[c] for c in sorted(p.masks)]} for p in real],
-            "scattered": [patch.date for patch in all_found.found if patch not in real],
+            "scattered": [date for date, together in placed.items() if not together],
             "cuts": list(all_found.cuts),
         }
 
