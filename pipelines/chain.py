@@ -54,6 +54,16 @@ Piece = tuple[Key, Future, Span]
 
 
 @dataclass(frozen=True)
+class Epoch:
+    """The time between two dates at which something changes for good."""
+
+    start: int
+    """Its first instant"""
+    background: Key | None
+    backdrop: Key | None
+
+
+@dataclass(frozen=True)
 class Chain:
     """What every fit of a sequence reads, and who starts it."""
 
@@ -62,43 +72,55 @@ class Chain:
     options: SequenceOptions
     submit: Submit
     take: Take
-    background: Key | None
-    backdrop: Key | None
+    epochs: Sequence[Epoch]
+    """Ascending, the first from instant 0 on; mostly the only one. No segment lies in two"""
     motion: Key
 
     def fit(self, spans: Sequence[range]) -> Iterator[tuple[Key, Key]]:
         """A keyframe and its segment for each span in order, and for each piece that a promoted keyframe cuts off.
 
         Side by side, all keyframes start from the backdrop, and none waits for another. One at a time, all but the
-        first go on from the end of the segment before, which costs less and shows no border.
+        first of an epoch go on from the end of the segment before, which costs less and shows no border.
         """
         numbered = [Span(number, span) for number, span in enumerate(spans, start=1)]
         pieces = self._pieces(numbered)
         before: Piece | None = None
         for index, span in enumerate(numbered):
             own = pieces.get(index)
-            if before and (own is None or self._shows(before, own)):
+            if before and not self._begins_epoch(span) and (own is None or self._shows(before, own)):
                 own = self._continue(before, span)
-            assert own is not None, "the first span has a keyframe of its own"
+            assert own is not None, "the first span of an epoch has a keyframe of its own"
             for piece in self._promote(*own):
                 before = piece
                 yield piece[0], piece[1].result()
 
     def pilot(self, span: range) -> tuple[Key, Key]:
         """A keyframe at the start of the span, as the first one of a sequence is, and its segment."""
-        key = self._first(span.start) if self.backdrop is None else self._next(self.backdrop, span.start)
+        backdrop = self._epoch(span.start).backdrop
+        key = self._first(span.start) if backdrop is None else self._next(backdrop, span.start)
         return key.result(), self._segment(key.result(), Span(1, span)).result()
 
     def _pieces(self, spans: Sequence[Span]) -> dict[int, Piece]:
-        """Those whose keyframe goes on from no segment, by place: the first, side by side all of them, and without a
-        backdrop those up to the one that most cameras filmed."""
-        alone = range(len(spans) if self.plan.side_by_side else 1)
-        if self.backdrop is None:
+        """Those whose keyframe goes on from no segment, by place: the first of each epoch, side by side all of them,
+        and without a backdrop those up to the one that most cameras filmed."""
+        if self.epochs[0].backdrop is None:
+            alone = range(len(spans) if self.plan.side_by_side else 1)
             starts = [span.instants.start for span in spans]
             pictures = count_pictures(self.workshop, self.plan, self.take.groups, starts)
             return dict(self._linked(spans, alone, *fitting_order(pictures)))
-        keys = [self._next(self.backdrop, spans[index].instants.start) for index in alone]
-        return {index: self._piece(key.result(), spans[index]) for index, key in zip(alone, keys, strict=True)}
+        keys = {
+            index: self._next(backdrop, span.instants.start)
+            for index, span in enumerate(spans)
+            if (self.plan.side_by_side or self._begins_epoch(span))
+            and (backdrop := self._epoch(span.instants.start).backdrop)
+        }
+        return {index: self._piece(key.result(), spans[index]) for index, key in keys.items()}
+
+    def _epoch(self, instant: int) -> Epoch:
+        return next(epoch for epoch in reversed(self.epochs) if epoch.start <= instant)
+
+    def _begins_epoch(self, span: Span) -> bool:
+        return self._epoch(span.instants.start).start == span.instants.start
 
     def _linked(
         self, spans: Sequence[Span], alone: range, anchor: int, steps: Sequence[tuple[int, int]]
@@ -150,7 +172,7 @@ class Chain:
         return self.submit(
             FitNext(
                 take=self.take,
-                background=self.background,
+                background=self._epoch(instant).background,
                 previous=key,
                 end=end,
                 instant=instant,

@@ -8,7 +8,7 @@ from typing import Any
 
 from packuv.fit.options import FitOptions
 from packuv.footage import LightOptions, Transfer
-from packuv.motion import KeyframeOptions, MotionOptions
+from packuv.motion import KeyframeOptions, MotionOptions, PatchOptions
 from packuv.scene import TOLERANCES, EncodeOptions, Quality
 from pipelines.ladder import LADDER
 from pipelines.request import QUALITIES
@@ -30,6 +30,7 @@ class SequenceOptions:
     light: LightOptions = field(default_factory=LightOptions)
     points: PointOptions = field(default_factory=PointOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
+    patches: PatchOptions = field(default_factory=PatchOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
     encode: EncodeOptions = field(default_factory=EncodeOptions)

@@ -33,6 +33,7 @@ from tasks.report.facts import (
     Choice,
     Comparison,
     FrameScore,
+    LastingChange,
     LightCurve,
     MotionCurve,
     ReportInput,
@@ -157,7 +158,7 @@ def collect(run: Run) -> ReportInput:
         unlike=_points_notes(run).get("unlike", {}),
         log_like=tuple(_points_notes(run).get("log_like", ())),
         light=_light(run.folder("light")),
-        motion=_curve(run.folder("keyframes")),
+        motion=_curve(run),
         scores=scores,
         scene=_scene(run),
         pictures=tuple(_pictures(run.folder("evaluate"))),
@@ -193,8 +194,13 @@ def _light(folder: Path | None) -> LightCurve | None:
     return LightCurve(light.light, light.exposures, read_steady(folder))
 
 
-def _curve(folder: Path | None) -> MotionCurve | None:
-    return MotionCurve(np.array(read_curve(folder)), tuple(read_keyframes(folder))) if folder else None
+def _curve(run: Run) -> MotionCurve | None:
+    folder, patches = run.folder("keyframes"), run.made.get("patches")
+    if folder is None:
+        return None
+    notes = run.workshop.store.receipt(patches).notes if patches else {"patches": (), "cuts": ()}
+    changes = tuple(LastingChange(patch["instant"], tuple(patch["cameras"])) for patch in notes["patches"])
+    return MotionCurve(np.array(read_curve(folder)), tuple(read_keyframes(folder)), changes, tuple(notes["cuts"]))
 
 
 def _scores(folder: Path | None) -> tuple[FrameScore, ...]:

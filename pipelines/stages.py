@@ -10,9 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from packuv.fit.options import FirstOptions
+from packuv.fit.options import FirstOptions, NextOptions
 from packuv.lpips import lacking
-from pipelines.chain import Chain, Submit
+from packuv.motion.keyframes import fitting_order
+from packuv.motion.patches import epochs
+from pipelines.chain import Chain, Epoch, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
@@ -23,13 +25,20 @@ from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig
 from tasks.stages.encode import Encode, Verify
 from tasks.stages.evaluate import Evaluate, scored_cameras
-from tasks.stages.fitting import FitBackdrop, background_of, count_pictures, lacks_backdrop
+from tasks.stages.fitting import (
+    FitBackdrop,
+    PatchBackdrop,
+    PatchBackground,
+    background_of,
+    count_pictures,
+    lacks_backdrop,
+)
 from tasks.stages.footage import PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.synchronize import synchronize
-from tasks.stages.track import ChooseKeyframes, FindMotion, read_spans
+from tasks.stages.track import ChooseDatedKeyframes, ChooseKeyframes, DatePatches, FindMotion, read_patches, read_spans
 
 
 @dataclass
@@ -155,8 +164,25 @@ class Sequence:
         return self._make(borrow_rig(self.workshop, self.plan, groups, pictures, self.lender.workshop, lent, options))
 
     def _track(self) -> None:
-        motion = self._make(FindMotion(take=self._take("rig"), options=self.options.motion))
-        self._make(ChooseKeyframes(motion=motion, options=self.options.keyframes))
+        take, options = self._take("rig"), self.options
+        motion = self._make(FindMotion(take=take, options=options.motion))
+        if patches := self._patches(take):
+            self._make(ChooseDatedKeyframes(motion=motion, patches=patches, options=options.keyframes))
+        else:
+            self._make(ChooseKeyframes(motion=motion, options=options.keyframes))
+
+    def _patches(self, take: Take) -> Key | None:
+        """What changes for good; None where nothing does, so that nothing depends on how that was found."""
+        if not (self.options.patches.enabled and self.options.fit.background.instants):
+            off = "patches.enabled is false" if not self.options.patches.enabled else "fit.background.instants is 0"
+            self.workshop.listener.skipped("patches", off)
+            return None
+        self._make(DatePatches(take=take, options=self.options.patches))
+        return self._dated()
+
+    def _dated(self) -> Key | None:
+        key = self.made.get("patches")
+        return key if key and read_patches(self.workshop.path(key)).found else None
 
     def _fit(self) -> None:
         spans = self._spans()
@@ -171,10 +197,8 @@ class Sequence:
     def _chain(self, spans: list[range]) -> Chain:
         take = self._take("points")
         told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
-        background = self._background(take)
-        backdrop = self._backdrop(told, background, spans)
-        motion = self.made.only("motion")
-        return Chain(self.workshop, self.plan, self.options, self.submit, told, background, backdrop, motion)
+        parts, motion = self._epochs(take, told, spans), self.made.only("motion")
+        return Chain(self.workshop, self.plan, self.options, self.submit, told, parts, motion)
 
     def _background(self, take: Take) -> Key | None:
         options = self.options.fit.background
@@ -183,15 +207,35 @@ class Sequence:
             return None
         return self._make(background_of(self.workshop, take, options))
 
-    def _backdrop(self, take: Take, background: Key | None, spans: list[range]) -> Key | None:
-        if background is None:
-            return None
+    def _epochs(self, take: Take, told: Take, spans: list[range]) -> list[Epoch]:
+        """The times between the dates at which something changes for good, each with what stands still in it."""
+        background, dated = self._background(take), self._dated()
+        if background is None or not self._has_backdrop(take, background, spans):
+            return [Epoch(0, background, None)]
+        fit = self.options.fit
+        if dated is None:
+            first = FitBackdrop(take=told, background=background, options=fit.part(FirstOptions))
+            return [Epoch(0, background, self._make(first))]
+        times = epochs(read_patches(self.workshop.path(dated)).dates, spans[-1].stop)
+        under_way = [
+            self.submit(PatchBackground(take=take, background=background, patches=dated, epoch=number,
+                                        options=fit.background)) for number in range(len(times))
+        ]  # fmt: skip
+        stills = [self.made.add(future.result()) for future in under_way]
+        longest, steps = fitting_order([len(time) for time in times])
+        whole = FitBackdrop(take=told, background=stills[longest], options=fit.part(FirstOptions))
+        backdrops = {longest: self._make(whole)}
+        for number, beside in steps:
+            patch = PatchBackdrop(take=told, previous=backdrops[beside], before=stills[beside], after=stills[number],
+                                  options=fit.part(NextOptions), epoch=number)  # fmt: skip
+            backdrops[number] = self._make(patch)
+        return [Epoch(time.start, stills[number], backdrops[number]) for number, time in enumerate(times)]
+
+    def _has_backdrop(self, take: Take, background: Key, spans: list[range]) -> bool:
         pictures = count_pictures(self.workshop, self.plan, take.groups, [span.start for span in spans])
         if reason := lacks_backdrop(self.workshop, background, max(pictures)):
             self.workshop.listener.skipped("backdrop", reason)
-            return None
-        fit = self.options.fit.part(FirstOptions)
-        return self._make(FitBackdrop(take=take, background=background, options=fit))
+        return reason is None
 
     def _spans(self) -> list[range]:
         return read_spans(self.workshop.path(self.made.only("keyframes")))

@@ -88,6 +88,8 @@ class SimulateOptions:
     """Which of the things that can move do; the others stand as at the start. None at all: a still scene"""
     crowd: int = 0
     """Persons who walk round beside the walker, all over the room: with 27 most of a picture moves"""
+    parcel_share: float = 0.0
+    """From the tick after this share of the capture on a parcel stands on the floor; 0: there is none"""
     truth: TruthKind = TruthKind.FULL
     calibration: CalibrationKind = CalibrationKind.GIVEN
     held_out: int | None = None
@@ -108,6 +110,8 @@ class SimulateOptions:
             raise ValueError(f"samples must be 1 to 8 rays along each axis of a pixel, but is {self.samples}")
         if not 0 <= self.entrance_share <= 1:
             raise ValueError(f"entrance_share must be 0 to 1, but is {self.entrance_share}")
+        if not 0 <= self.parcel_share <= 1:
+            raise ValueError(f"parcel_share must be 0 to 1, but is {self.parcel_share}")
         if not 0 <= self.held_out_count <= self.cameras - 2:
             raise ValueError(
                 f"held_out must leave two cameras to fit: 0 to {self.cameras - 2} of {self.cameras}, "
@@ -120,6 +124,11 @@ class SimulateOptions:
         if not 0 <= self.crowd <= sum(CROWD):
             raise ValueError(f"a crowd has 0 to {sum(CROWD)} persons, but is {self.crowd}")
         self._check_size()
+
+    @property
+    def parcel_tick(self) -> int | None:
+        """The first tick that shows the parcel; None: there is none."""
+        return round(self.parcel_share * self.frames) if self.parcel_share else None
 
     @property
     def held_out_count(self) -> int:
@@ -202,7 +211,8 @@ def _write(
     entrance_ns = EPOCH_NS + round(entrance_s * SECOND_NS)
     recordings = _recordings(rig, times, held_out, options)
     ticks_ns = tick_times(options.frames, options.fps)
-    truth = truth_json(_plain(options), options.fps, ticks_ns, light, entrance_ns, recordings)
+    parcel_ns = None if options.parcel_tick is None else int(ticks_ns[min(options.parcel_tick, len(ticks_ns) - 1)])
+    truth = truth_json(_plain(options), options.fps, ticks_ns, light, entrance_ns, parcel_ns, recordings)
     (folder / "truth" / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
     _film_all(folder, entrance_s, light, recordings, options, progress)
 
@@ -237,6 +247,7 @@ def _film_all(
     report = progress or (lambda done, total: None)
     done, total = 0, sum(len(recording.times.ticks) for recording in recordings)
     report(done, total)
+    tick = options.parcel_tick
     film_set = build_set(
         options.seed,
         entrance_s,
@@ -244,6 +255,8 @@ def _film_all(
         wall_lamps=options.light.wall_lamps,
         moving=options.movers,
         crowd=options.crowd,
+        # a hair before the tick, for times are whole nanoseconds
+        parcel_s=None if tick is None else float((tick - Fraction(1, 100)) / options.fps),
     )
     for recording in recordings:
         for _ in film(folder, film_set, light, recording, options):

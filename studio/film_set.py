@@ -2,7 +2,8 @@
 
 A person walks round in a circle about a bouncing ball; a crate turns on a plinth; a banner waves; an inflatable column
 sways and breathes. Late in the capture a sliding door opens and a second person, whom no camera has seen until then,
-walks in and waves. Everything is a function of time alone.
+walks in and waves. If asked for, a parcel stands on the floor from one instant on. Everything is a function of time
+alone.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from studio.standing import VOXEL_M, clearance_of
 from studio.textures import Textures, paint_textures
 
 STANDING = ("room", "lamp", "furniture", "things", "pictures", "vase")
-MOVING = ("walker", "visitor", "ball", "crate", "banner", "inflatable", "door")
+MOVING = ("walker", "visitor", "ball", "crate", "banner", "inflatable", "door", "parcel")
 OBJECTS = STANDING + MOVING
 """Names by object id"""
 GRAVITY = 9.81
@@ -45,6 +46,8 @@ DOOR_TRAVEL, DOOR_SECONDS = 1.06, 0.7
 VISITOR_FROM, VISITOR_TO, VISITOR_SPEED = 4.62, 1.75, 1.05
 """y of the visitor's way in along x = VISITOR_X, and how fast"""
 VISITOR_X = (DOOR_LEFT + DOOR_RIGHT) / 2
+PARCEL, PARCEL_HALF = (0.85, 1.1), (0.28, 0.22, 0.25)
+"""Where the parcel stands on the floor, and half its sides, metres"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,8 @@ class FilmSet:
     """Those of MOVING that do; the others stand as at the start"""
     crowd: int = 0
     """Persons who walk round beside the walker, and whose shapes count as the walker's"""
+    parcel_s: float | None = None
+    """From when on the parcel stands there; None: never"""
 
     def at(self, seconds: float) -> Moment:
         """What moves, `seconds` after the start of the capture."""
@@ -97,6 +102,7 @@ def build_set(
     wall_lamps: float = 0.0,
     moving: tuple[str, ...] = MOVING,
     crowd: int = 0,
+    parcel_s: float | None = None,
 ) -> FilmSet:
     """Paint and furnish the room; takes some seconds, and is remembered. `LightOptions` has shine and wall lamps."""
     textures = _textures(seed)
@@ -107,7 +113,7 @@ def build_set(
     if wall_lamps > 0:
         add_wall_lamps(parts, owners["lamp"], wall_lamps)
     standing = parts.shapes()
-    return FilmSet(entrance_s, standing, _light(standing), paints(textures), textures, moving, crowd)
+    return FilmSet(entrance_s, standing, _light(standing), paints(textures), textures, moving, crowd, parcel_s)
 
 
 def _light(standing: Shapes) -> Light:
@@ -271,6 +277,15 @@ def _add_door(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np
     return np.zeros((0, 4))
 
 
+def _add_parcel(parts: Parts, owner: int, film_set: FilmSet, seconds: float) -> np.ndarray:
+    """A carton that nobody brings: it is there from one instant to the next."""
+    if film_set.parcel_s is None or seconds < film_set.parcel_s:
+        return np.zeros((0, 4))
+    centre = np.array([*PARCEL, PARCEL_HALF[2]])
+    parts.box(owner, centre, np.array(PARCEL_HALF), Look("carton", (1.5, 1.5), (0.5, 0.5)), turn_about_z(0.5))
+    return np.array([[*centre, 1.1 * max(PARCEL_HALF)]])
+
+
 def _ease(share: float) -> float:
     """0 up to 0, 1 from 1 on, with no jerk at either end."""
     t = float(np.clip(share, 0, 1))
@@ -290,4 +305,5 @@ MOVERS: dict[str, Callable[[Parts, int, FilmSet, float], np.ndarray]] = {
     "banner": _add_banner,
     "inflatable": _add_inflatable,
     "door": _add_door,
+    "parcel": _add_parcel,
 }

@@ -23,7 +23,7 @@ from studio.light import LensShading
 from studio.raycast import Hits, Motion
 from studio.rig import StudioCamera
 
-VERSION = 2
+VERSION = 3
 MOVES, SEEN = 1, 2
 """Bits of the flags"""
 
@@ -104,6 +104,8 @@ class Truth:
     """float64 [T, 3]: factors r g b of the lamps' light at the ticks, geometric mean 1 per channel"""
     entrance_ns: int
     """True time at which the door begins to open"""
+    parcel_ns: int | None
+    """True time of the first tick that shows the parcel; None: there is none"""
     objects: tuple[str, ...]
     """Names by object id"""
     movers: tuple[str, ...]
@@ -129,6 +131,7 @@ def read_truth(capture: Path) -> Truth:
         tick_times_ns=np.array(data["tick_times_ns"], np.int64),
         light=np.array(data["light"], np.float64),
         entrance_ns=data["entrance_ns"],
+        parcel_ns=data["parcel_ns"],
         objects=tuple(data["objects"]),
         movers=tuple(data["movers"]),
         cameras={name: _camera_from_json(name, item, path.parent) for name, item in data["cameras"].items()},
@@ -141,6 +144,7 @@ def truth_json(
     ticks_ns: np.ndarray,  # int64 [T]
     light: np.ndarray,  # float64 [T, 3]
     entrance_ns: int,
+    parcel_ns: int | None,
     recordings: Sequence[Recording],
 ) -> dict[str, Any]:
     """Contents of truth.json."""
@@ -151,6 +155,7 @@ def truth_json(
         "tick_times_ns": ticks_ns.tolist(),
         "light": light.tolist(),
         "entrance_ns": entrance_ns,
+        "parcel_ns": parcel_ns,
         "objects": list(OBJECTS),
         "movers": list(MOVING),
         "cameras": {recording.camera.name: _camera_to_json(recording) for recording in recordings},

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from packuv.budget import Budget
+from packuv.camera import PinholeCamera
 from packuv.each import Each, as_bits, packed
 from packuv.files import save_json, save_npz
 from packuv.fit.backdrop import Backdrop, joined
@@ -32,7 +33,7 @@ from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
 from packuv.fit.shots import Shot, find_shots, halved, moving_rows
 from packuv.fit.solver import Losses, Solver, tiled
 from packuv.fit.start.bounds import Bounds, find_bounds
-from packuv.fit.start.first import first_gaussians, neighbour_distance, round_gaussians
+from packuv.fit.start.first import AIR_OPACITY, first_gaussians, neighbour_distance, round_gaussians
 from packuv.fit.start.hull import hull_points, in_hull
 from packuv.fit.start.points import Points, drawn, no_points
 from packuv.fit.start.shell import Shell, sweep_shell
@@ -47,8 +48,6 @@ LEAST_KNOWN = 0.5
 """Share of the pictures that must be known to stand still for a backdrop"""
 FOREGROUND_GAIN = 0.01
 """Share of the loss that the bands of a keyframe's own Gaussians must gain; without, they cost nothing in the file"""
-BIRTH_OPACITY = 0.1
-"""Of what is born in a hull, which is mostly air"""
 DEAD_CODE = 1
 """Opacity codes up to this one decode below 1/255, which no renderer draws"""
 
@@ -125,7 +124,7 @@ def fit_backdrop(
     """
     if len(stills) < 2:
         raise ValueError(f"a backdrop needs what stands still in two cameras, but is given {len(stills)}")
-    shots = [_still_shot(views, stills, index) for index in range(len(stills))]
+    shots = [still_shot(views, stills, index) for index in range(len(stills))]
     room = replace(options.density, cap=round(options.backdrop_share * options.density.cap))
     state = _fit_all(views, shots, None, points, replace(options, density=room), progress)
     drawn = state.quantizer.encode(state.gaussians).attributes[:, OPACITY] > DEAD_CODE
@@ -153,7 +152,7 @@ def _fit_all(
     options = replace(options, start=options.start.within(options.density.cap))
     bounds = find_bounds(views.cameras, near_share=options.near_share)
     rng = np.random.default_rng([options.seed, 0 if instant is None else instant, 0])
-    cameras, targets = [shot.camera for shot in shots], Each(lambda index: _undone(shots[index]), len(shots))
+    cameras, targets = [shot.camera for shot in shots], Each(lambda index: undone(shots[index]), len(shots))
     shell = sweep_shell(cameras, targets, bounds=bounds, options=options.shell) if options.shell.enabled else None
     start = first_gaussians(cameras, targets, bounds=bounds, surface=_surface(shell, points, options),
                             options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
@@ -183,7 +182,7 @@ def _fit_all(
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
     solver.fix(choose_quantizer(model.gaussians, bounds, 0 if judgement is None else judgement.degree))
     losses = solver.run(shots, total - floating, of=total, ticks=ticks)
-    figures = _figures(started, losses, solver) | ({} if judgement is None else {"sh": judgement.to_json()})
+    figures = figures_of(started, losses, solver) | ({} if judgement is None else {"sh": judgement.to_json()})
     return KeyState(instant, model.gaussians, 0, solver.known_quantizer, bounds, figures)
 
 
@@ -214,18 +213,18 @@ def fit_next(
     masks = standing if previous.instant is None else _changes(views, previous.instant, instant, motion)
     shots = find_shots(views, instant, masks)
     if not shots:
-        return replace(previous, instant=instant, figures=_figures(started, {}, solver))
+        return replace(previous, instant=instant, figures=figures_of(started, {}, solver))
     if previous.instant is not None:
         before = _standing(views, previous.instant, stills, motion)
-        gone = _inside(model.gaussians, views, before, bounds, options)
-        solver.keep(~gone | _inside(model.gaussians, views, standing, bounds, options))
+        gone = inside(model.gaussians, views, before, bounds, options)
+        solver.keep(~gone | inside(model.gaussians, views, standing, bounds, options))
     solver.free(moving_rows(model.gaussians, quantizer, views, masks, bounds, options))
     solver.make_room(shots)
     seen = Each(lambda index: masks[index] if standing[index] is None else standing[index], len(masks))
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
     if not solver.rows.any():  # nothing that enough cameras see
-        figures = _figures(started, {}, solver)
+        figures = figures_of(started, {}, solver)
         return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
     ticks, judgement, born_from = Ticks(progress, options.key_iterations), None, len(model)
     if quantizer.sh_degree:
@@ -233,7 +232,7 @@ def fit_next(
     count = options.key_iterations
     losses = solver.run(shots, count - solver.done, of=count, grow_from=born_from, ticks=ticks)
     solver.keep(~solver.rows | solver.worth_keeping())
-    figures = _figures(started, losses, solver) | ({} if judgement is None else {"sh": judgement.to_json()})
+    figures = figures_of(started, losses, solver) | ({} if judgement is None else {"sh": judgement.to_json()})
     return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
 
 
@@ -259,13 +258,14 @@ def _changes(views: Views, first: int, last: int, motion: MotionOptions) -> Sequ
     return as_bits(changed_between(views, camera, first, last, motion) for camera in range(len(views.cameras)))
 
 
-def _still_shot(views: Views, stills: Sequence[Still], index: int) -> Shot:
+def still_shot(views: Views, stills: Sequence[Still], index: int) -> Shot:
+    """What stands still in a camera, as a picture to explain."""
     still = stills[index]
     camera, response = views.cameras[still.camera], views.response(still.camera, None)
     return Shot(camera, lambda: as_planes(stills[index].pixels), response, known=packed(still.known))
 
 
-def _undone(shot: Shot) -> np.ndarray:
+def undone(shot: Shot) -> np.ndarray:
     """The picture in the rig's common colour, float32 [3, H, W]."""
     return shot.response.undone(shot.target)
 
@@ -287,7 +287,7 @@ def _standing(
     return as_bits(mask(camera) for camera in range(len(views.cameras)))
 
 
-def _inside(
+def inside(
     gaussians: Gaussians,
     views: Views,
     masks: Sequence[np.ndarray | None],
@@ -356,15 +356,32 @@ def _hull_gaussians(
     """New Gaussians inside the hull of the masks: what moved there since the last keyframe has none yet."""
     seeing = [index for index, mask in enumerate(masks) if mask is not None and views.has(index, instant)]
     pictures = Each(lambda camera: views.picture(camera, instant), len(views.cameras))
-    points = hull_points([views.cameras[index] for index in seeing], _those(pictures, seeing), _those(masks, seeing),
-                         bounds=bounds, options=options.start, count=options.key_births, rng=rng)  # fmt: skip
+    cameras = [views.cameras[index] for index in seeing]
+    return born_in_hull(cameras, _those(pictures, seeing), _those(masks, seeing), bounds, options, rng,
+                        sh_degree, options.key_births)  # fmt: skip
+
+
+def born_in_hull(
+    cameras: Sequence[PinholeCamera],
+    pictures: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray],
+    bounds: Bounds,
+    options: KeyframeOptions,
+    rng: np.random.Generator,
+    sh_degree: int,
+    count: int,
+) -> Gaussians:
+    """At most `count` Gaussians in the hull of masks, bool [H, W], coloured by the pictures, float32 [3, H, W], in the
+    rig's colours."""
+    points = hull_points(cameras, pictures, masks, bounds=bounds, options=options.start, count=count, rng=rng)
     spacing = neighbour_distance(points.xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 0.02 * bounds.radius)
-    born = round_gaussians(points.xyz, points.rgb, scale, opacity=BIRTH_OPACITY, sh_degree=sh_degree)
+    born = round_gaussians(points.xyz, points.rgb, scale, opacity=AIR_OPACITY, sh_degree=sh_degree)
     return with_canonical_axes(born)
 
 
-def _figures(started: float, losses: Losses, solver: Solver) -> dict[str, Any]:
+def figures_of(started: float, losses: Losses, solver: Solver) -> dict[str, Any]:
+    """What a fit that began at `started`, monotonic seconds, measured."""
     return {
         "seconds": time.monotonic() - started,
         "loss": sum(losses.values()),

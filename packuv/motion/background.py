@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
 
@@ -56,13 +56,17 @@ def find_background(
     progress: Progress = no_progress,
     *,
     least: int = 3,
+    among: range | None = None,
     workers: int = 2,
 ) -> list[Still]:
-    """Backgrounds of the cameras that filmed at least `least` of the chosen instants; an empty stage needs one.
+    """Backgrounds of the cameras that filmed at least `least` of the instants chosen `among` some, by default all; an
+    empty stage needs one.
 
     `workers` cameras at a time, each with the pictures of all instants in memory.
     """
-    instants = np.unique(np.linspace(0, len(views) - 1, min(options.instants, len(views))).round().astype(int))
+    among = range(len(views)) if among is None else among
+    count = min(options.instants, len(among))
+    instants = np.unique(np.linspace(among.start, among.stop - 1, count).round().astype(int))
 
     def look(camera: int) -> Still | None:
         pictures = [views.steady(camera, int(instant), remember=False) for instant in instants]
@@ -75,6 +79,12 @@ def find_background(
             stills += [still] if still else []
             progress(camera + 1, len(views.cameras))
     return stills
+
+
+def patched(usual: Still, own: Still, places: np.ndarray) -> Still:
+    """A background with another one, of the same camera, in some places, bool [H, W]."""
+    pixels = np.where(places[:, :, None], own.pixels, usual.pixels)
+    return replace(usual, pixels=pixels, known=np.where(places, own.known, usual.known))
 
 
 def save_stills(path: Path, stills: Sequence[Still]) -> None:

@@ -19,6 +19,8 @@ class Reason(StrEnum):
     """Why an instant is a keyframe."""
 
     START = "start"
+    DATE = "date"
+    """Something changes for good, see `packuv.motion.patches`"""
     PEAK = "peak"
     SPLIT = "split"
     """It halves (or thirds, ...) a stretch without a peak that is longer than `max_segment`"""
@@ -99,26 +101,29 @@ def running_mean(values: np.ndarray, width: int) -> np.ndarray:
     return sums / np.convolve(np.ones(len(values)), np.ones(2 * half + 1))[inner]
 
 
-def choose_keyframes(curve: np.ndarray, options: KeyframeOptions) -> list[Keyframe]:
-    """Keyframes of a motion curve, ascending; instant 0 is always the first.
+def choose_keyframes(curve: np.ndarray, options: KeyframeOptions, dates: Sequence[int] = ()) -> list[Keyframe]:
+    """Keyframes of a motion curve, ascending; instant 0 is always the first, and each of the `dates` is one.
 
     Peaks are taken from the highest down (of equals the earlier), if they keep `separation` from all before; then
-    stretches longer than `max_segment` are divided evenly. Without any motion there is one keyframe.
+    stretches longer than `max_segment` are divided evenly. Without any motion there is one keyframe, and one a date.
     """
     if curve.ndim != 1 or not len(curve) or not (np.isfinite(curve).all() and (curve >= 0).all()):
         raise ValueError(f"a motion curve must be finite, not negative and not empty, but is {curve.shape}: {curve}")
+    if any(not 0 < date < len(curve) for date in dates):
+        raise ValueError(f"dates must lie after instant 0 and before {len(curve)}, but are {list(dates)}")
+    fixed = [Keyframe(0, Reason.START), *(Keyframe(date, Reason.DATE) for date in sorted(dates))]
     if not curve.any():
-        return [Keyframe(0, Reason.START)]
-    chosen = SortedList([0])
+        return fixed
+    chosen, peaks = SortedList(keyframe.instant for keyframe in fixed), list[Keyframe]()
     for peak in _peaks(curve, options.prominence * curve.max()):
-        if options.peaks is not None and len(chosen) > options.peaks:
+        if options.peaks is not None and len(peaks) >= options.peaks:
             break
         near = chosen.irange(peak - options.separation, peak + options.separation, inclusive=(False, False))
         if next(near, None) is None:
             chosen.add(peak)
-    keyframes = [Keyframe(instant, Reason.PEAK if instant else Reason.START) for instant in chosen]
+            peaks.append(Keyframe(peak, Reason.PEAK))
     splits = [Keyframe(instant, Reason.SPLIT) for instant in _splits(chosen, len(curve), options.max_segment)]
-    return sorted([*keyframes, *splits], key=lambda keyframe: keyframe.instant)
+    return sorted([*fixed, *peaks, *splits], key=lambda keyframe: keyframe.instant)
 
 
 def segments(keyframes: Sequence[Keyframe], count: int) -> list[range]:

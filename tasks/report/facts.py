@@ -56,6 +56,15 @@ class StageRecord:
 
 
 @dataclass(frozen=True)
+class LastingChange:
+    """Something changes for good: from this frame on another backdrop stands behind what moves."""
+
+    frame: int
+    cameras: tuple[str, ...]
+    """That saw it"""
+
+
+@dataclass(frozen=True)
 class MotionCurve:
     """How much moves at each instant."""
 
@@ -63,6 +72,9 @@ class MotionCurve:
     """float [T]: M(t), the smoothed mean of |flow|, pixels"""
     keyframes: tuple[int, ...]
     """Instants at which segments start"""
+    changes: tuple[LastingChange, ...] = ()
+    cuts: tuple[int, ...] = ()
+    """Instants at which so much of the pictures changes that the scene may be cut there"""
 
     def __post_init__(self) -> None:
         count = len(self.magnitude_px)

@@ -64,6 +64,7 @@ def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...
         *_sync_findings(report, limits),
         *_rig_findings(report, limits),
         *_light_findings(report, limits),
+        *_motion_findings(report),
         *_score_findings(report, limits),
         *_scene_findings(report, limits),
     )
@@ -135,6 +136,12 @@ def _light_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
         if not 1 / limits.exposure_jump <= factor <= limits.exposure_jump:
             text = f"The exposure of {camera} jumps by a factor of {factor:.2f} at frame {instant}"
             yield Finding("light", f"{text}; fit and scores allow for it.")
+
+
+def _motion_findings(report: ReportInput) -> Iterator[Finding]:
+    for instant in report.motion.cuts if report.motion else ():
+        text = f"Most of the pictures change for good at about frame {instant}"
+        yield Finding("motion", f"{text}; if the scene is cut there, process the parts apart with --frames.")
 
 
 def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:

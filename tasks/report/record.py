@@ -45,6 +45,8 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
         and {
             "magnitude_px": [float(v) if math.isfinite(v) else None for v in report.motion.magnitude_px],
             "keyframes": list(report.motion.keyframes),
+            "changes": [plain(change) for change in report.motion.changes],
+            "cuts": list(report.motion.cuts),
         },
         "scores": [_score_json(score) for score in report.scores],
         "scene": report.scene and {**plain(report.scene), "mb_per_30_frames": report.scene.mb_per_30_frames},

@@ -212,6 +212,7 @@ def _motion(report: ReportInput) -> Body:
         "segments": len(motion.keyframes),
         "shortest": min(lengths, default=0),
         "longest": max(lengths, default=0),
+        "changes": [{"frame": change.frame, "cameras": change.cameras} for change in motion.changes],
         "curve": line_chart(
             series, title="Motion", x_label="frame", y_label="optical flow, px", marks=motion.keyframes, from_zero=True
         ),

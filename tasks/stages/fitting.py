@@ -18,6 +18,7 @@ from packuv.fit.bands import told
 from packuv.fit.frames import fit_segment
 from packuv.fit.keyframe import KeyState, enough_stands_still, fit_backdrop, fit_first, fit_next
 from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
+from packuv.fit.patch import fit_patch, whole_places
 from packuv.fit.seam import seam, tail
 from packuv.fit.start.points import Points
 from packuv.gaussians.rows import hold_absent
@@ -29,8 +30,10 @@ from packuv.motion import (
     Plate,
     Still,
     compare_plate,
+    epochs,
     find_background,
     load_stills,
+    patched,
     save_stills,
 )
 from sync.align import FrameGroups
@@ -42,7 +45,7 @@ from tasks.stages.calibrate import POINTS
 from tasks.stages.footage import Footage, Take
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import selected
-from tasks.stages.track import MOTION
+from tasks.stages.track import MOTION, read_patches
 
 SEGMENT, FIGURES, STILLS, SEAM = "segment.npz", "fit.json", "stills.npz", "seam.json"
 PLATES, REFUSED = "plates.json", "refused"
@@ -105,7 +108,7 @@ class UsePlate(Stage):
 class FitBackdrop(Stage):
     """Fit what stands still, from which all keyframes start: state.npz and key.json, with the quantizer of all."""
 
-    name, version = "backdrop", 1
+    name, version = "backdrop", 2
     take: Take
     background: Key
     options: FirstOptions
@@ -131,10 +134,75 @@ class FitBackdrop(Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PatchBackground(Stage):
+    """What stands still between two dates: that of the whole sequence, but where something changes for good the median
+    of these instants: stills.npz."""
+
+    name, version = "background", 1
+    take: Take
+    background: Key
+    patches: Key
+    epoch: int
+    """Counted from 0, the time before the first date"""
+    options: BackgroundOptions
+
+    @property
+    def label(self) -> str:
+        return f"background of epoch {self.epoch + 1}"
+
+    def build(self, work: Work) -> Notes:
+        views, found = Footage(self.take, work.site).open_views(), read_patches(work.path(self.patches)).found
+        among = epochs([patch.date for patch in found], len(views))[self.epoch]
+        own = {
+            still.camera: still
+            for still in find_background(views, self.options, work.progress, among=among, workers=work.site.threads)
+        }
+        stills = []
+        for usual in _stills(work, self.background, views.budget):
+            masks = [whole_places(p.masks[usual.camera], views.cameras[usual.camera])
+                     for p in found if usual.camera in p.masks]  # fmt: skip
+            seen = masks and usual.camera in own
+            stills.append(patched(usual, own[usual.camera], np.any(masks, axis=0)) if seen else usual)
+        save_stills(work.out / STILLS, stills)
+        return {"cameras": len(stills), "known_share": float(np.mean([still.known.mean() for still in stills] or [0]))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchBackdrop(Stage):
+    """Fit the backdrop of an epoch from that of one beside it: state.npz and key.json."""
+
+    name, version = "backdrop", 2
+    take: Take
+    previous: Key
+    before: Key
+    """Background of `previous`"""
+    after: Key
+    options: NextOptions
+    epoch: int = field(compare=False)
+
+    @property
+    def label(self) -> str:
+        return f"patch backdrop for epoch {self.epoch + 1}"
+
+    def build(self, work: Work) -> Notes:
+        views = Footage(self.take, work.site).open_views(spill=work.scratch)
+        state = fit_patch(
+            KeyState.load(work.path(self.previous)),
+            views,
+            _stills(work, self.before, views.budget),
+            _stills(work, self.after, views.budget),
+            options=self.options,
+            progress=work.progress,
+        )
+        state.save(work.out)
+        return dict(state.figures)
+
+
+@dataclass(frozen=True, kw_only=True)
 class FitFirst(Stage):
     """Fit the keyframe that a chain without backdrop starts with: state.npz and key.json, with the quantizer of all."""
 
-    name, version = "key", 7
+    name, version = "key", 8
     take: Take
     instant: int
     options: FirstOptions
@@ -163,7 +231,7 @@ class FitNext(Stage):
     """Fit a keyframe from the backdrop, another keyframe, or the last frame of that one's segment: state.npz and
     key.json."""
 
-    name, version = "key", 7
+    name, version = "key", 8
     take: Take
     background: Key | None
     previous: Key
@@ -199,7 +267,7 @@ class FitNext(Stage):
 class FitSegment(Stage):
     """Fit the instants of a segment, which starts with its keyframe: segment.npz and fit.json."""
 
-    name, version = "segment", 6
+    name, version = "segment", 7
     take: Take
     motion: Key
     key: Key
@@ -232,7 +300,7 @@ class FitSegment(Stage):
 class CutSegment(Stage):
     """The first frames of a segment, as a segment."""
 
-    name, version = "segment", 6
+    name, version = "segment", 7
     segment: Key
     frames: int
 

@@ -1,23 +1,24 @@
-"""Track: what moves in every picture, and the keyframes that follow from it."""
+"""Track: what moves in every picture, what changes for good, and the keyframes that follow from both."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from packuv.files import save_json
-from packuv.motion import MotionCache, MotionOptions, measure_motion
+from packuv.fit.patch import in_one_place
+from packuv.motion import MotionCache, MotionOptions, Patches, PatchOptions, find_patches, measure_motion
 from packuv.motion.keyframes import KeyframeOptions, choose_keyframes, motion_curve, segments
 from tasks.artefacts.stage import Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.stages.footage import Footage, Take
 
-MOTION, KEYFRAMES = "motion", "keyframes.json"
+MOTION, KEYFRAMES, PATCHES = "motion", "keyframes.json", "patches.npz"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +38,36 @@ class FindMotion(Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DatePatches(Stage):
+    """Find what changes for good in the fitted cameras, and when: patches.npz."""
+
+    name, version = "patches", 1
+    take: Take
+    options: PatchOptions
+
+    def build(self, work: Work) -> Notes:
+        views = Footage(self.take, work.site).open_views()
+        all_found = find_patches(views, self.options, workers=work.site.threads, progress=work.progress)
+        placed = {patch.date: in_one_place(patch.masks, views.cameras) for patch in all_found.found}
+        real = tuple(patch for patch in all_found.found if placed[patch.date])
+        replace(all_found, found=real).save(work.out / PATCHES)
+        return {
+            "patches": [{"instant": p.date, "cameras": [views.names[c] for c in sorted(p.masks)]} for p in real],
+            "scattered": [date for date, together in placed.items() if not together],
+            "cuts": list(all_found.cuts),
+        }
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        for date in notes["scattered"]:
+            yield f"patch at {date}", "what changes in these cameras is no one place; it stays foreground"
+        for date in notes["cuts"]:
+            why = f"more than {self.options.most_area:.0%} of the pictures change at once: is the scene cut there?"
+            yield f"patch at {date}", f"{why} If so, process the parts apart with --frames"
+        if not any(notes.values()):
+            yield "patches", "no lasting change found"
+
+
+@dataclass(frozen=True, kw_only=True)
 class ChooseKeyframes(Stage):
     """Choose keyframes from the motion curve; segments in which nothing moves are named, since nobody fits them."""
 
@@ -47,7 +78,7 @@ class ChooseKeyframes(Stage):
     def build(self, work: Work) -> Notes:
         cache = MotionCache.load(work.path(self.motion) / MOTION)
         curve = motion_curve(cache.magnitude, cache.names, self.options)
-        keyframes = choose_keyframes(curve, self.options)
+        keyframes = choose_keyframes(curve, self.options, self.dates(work))
         spans = segments(keyframes, len(curve))
         moving = np.nan_to_num(_shares(cache)).max(axis=1) > 0  # [T]
         facts = {
@@ -59,10 +90,29 @@ class ChooseKeyframes(Stage):
         save_json(work.out / KEYFRAMES, facts)
         return {"keyframes": len(keyframes), "instants": len(curve)}
 
+    def dates(self, work: Work) -> tuple[int, ...]:
+        """Instants that are keyframes whatever moves there."""
+        return ()
+
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         for still in read_still(folder):
             why = f"nothing moves in instants {still.start} to {still.stop - 1}; each repeats the keyframe"
             yield f"fit frames {still.start}-{still.stop - 1}", why
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChooseDatedKeyframes(ChooseKeyframes):
+    """Choose keyframes where something changes for good, and others as ever."""
+
+    patches: Key
+
+    def dates(self, work: Work) -> tuple[int, ...]:
+        return read_patches(work.path(self.patches)).dates
+
+
+def read_patches(folder: Path) -> Patches:
+    """What changes for good."""
+    return Patches.load(folder / PATCHES)
 
 
 def read_spans(folder: Path) -> list[range]:

@@ -160,6 +160,15 @@ def test_a_changed_option_redoes_only_what_depends_on_it(first, capture):
     assert redone() == set()  # back to what was there at first
 
 
+def test_without_lasting_change_nothing_depends_on_how_that_was_found(first, capture):
+    outcome, said = first
+    assert "no lasting change found" in said
+    off, said = run(request(capture, outcome.folder.parent, settings={**SETTINGS, "patches": {"enabled": False}}))
+    assert "patches.enabled is false" in said
+    assert made(off) == set()
+    assert artefacts(off).items() == artefacts(outcome).items() - {("patches", artefacts(outcome)["patches"])}
+
+
 def seam_of(outcome: Outcome) -> float:
     """Flicker at the scene's border over that elsewhere, for the camera that was held out."""
     metrics = outcome.folder / "store" / artefacts(outcome)["evaluate"] / "metrics.json"
@@ -209,7 +218,7 @@ def test_an_earlier_stop_and_another_seed(first, capture):
     stopped, _ = run(request(capture, out, stop_after="flow", seed=1))
     assert made(stopped) == set()  # nothing before the fit reads the seed
     assert stopped.scene is None
-    assert set(artefacts(stopped)) == {"sync", "rig", "light", "points", "motion", "keyframes"}
+    assert set(artefacts(stopped)) == {"sync", "rig", "light", "points", "motion", "patches", "keyframes"}
 
 
 def test_light_may_be_left_out_and_changes_nothing_where_it_is_steady(first, capture, tmp_path):
@@ -218,7 +227,7 @@ def test_light_may_be_left_out_and_changes_nothing_where_it_is_steady(first, cap
     assert "less than 0.20%" in skipped["light of the instant"]
     without, _ = run(request(capture, tmp_path, settings={**SETTINGS, "light": {"enabled": False}}, stop_after="flow"))
     assert {event.label: event.reason for event in without.events}["light"] == "light.enabled is false"
-    assert set(artefacts(without)) == {"sync", "rig", "points", "motion", "keyframes"}
+    assert set(artefacts(without)) == {"sync", "rig", "points", "motion", "patches", "keyframes"}
     keys = artefacts(outcome)
     assert all(keys[stage] == key for stage, key in artefacts(without).items())
 
@@ -294,7 +303,7 @@ def test_a_video_that_is_another_one_for_a_while_leaves_nothing_wrong_behind(fir
         assert seen[-1] == "FindBackground"
         shutil.copyfile(capture / "videos/cam01.mp4", video)
         whole = process(asked, Journal(), Engine(stage_after("", video)), jobs_of(asked))
-    assert made(whole).isdisjoint({"sync", "rig", "light", "points", "motion", "keyframes"})
+    assert made(whole).isdisjoint({"sync", "rig", "light", "points", "motion", "patches", "keyframes"})
     assert sha256(whole.scene) == sha256(outcome.scene)
 
 

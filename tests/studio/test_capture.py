@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -82,6 +83,23 @@ def test_another_seed_is_another_capture(capture: Path, tmp_path: Path) -> None:
     one, two = digests(capture), digests(tmp_path / "other")
     for name in ("videos/cam01.mp4", "timecodes/cam01.txt", "calibration/images.txt", "truth/truth.json"):
         assert one[name] != two[name]
+
+
+def test_a_parcel_is_there_from_its_tick_on_and_changes_nothing_before(tmp_path: Path) -> None:
+    plain = SimulateOptions(cameras=2, frames=6, size="96x54", seed=7, clock=ClockOptions(0, 0), entrance_share=1.0)
+    simulate(tmp_path / "without", plain)
+    simulate(tmp_path / "with", replace(plain, parcel_share=0.5))
+    truth = read_truth(tmp_path / "with")
+    assert truth.parcel_ns == truth.tick_times_ns[3]
+    assert read_truth(tmp_path / "without").parcel_ns is None
+    parcel = truth.objects.index("parcel")
+    for name, camera in truth.cameras.items():
+        shown = [bool((camera.frame(frame).object == parcel).any()) for frame in range(6)]
+        assert shown == [False] * 3 + [True] * 3, name
+        before, after = (camera.frame(frame) for frame in (2, 4))
+        without = read_truth(tmp_path / "without").cameras[name]
+        assert np.array_equal(before.object, without.frame(2).object)
+        assert not after.moves[after.object == parcel].any()
 
 
 def test_the_project_reads_it(capture: Path, truth: Truth) -> None:

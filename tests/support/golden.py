@@ -95,7 +95,8 @@ def write() -> None:
 
 
 def _measure_here() -> Found:
-    from packuv.fit.options import FirstOptions
+    from packuv.fit.options import FirstOptions, NextOptions
+    from packuv.motion.patches import Patch, Patches
     from packuv.progress import no_progress
     from pipelines.options import compose
     from pipelines.stages import Made, Sequence
@@ -106,9 +107,10 @@ def _measure_here() -> Found:
     from tasks.artefacts.store import Key, Store
     from tasks.artefacts.workshop import Workshop
     from tasks.stages.calibrate import borrow_rig
-    from tasks.stages.fitting import CutSegment, FitFirst, FitNext, background_of
+    from tasks.stages.fitting import CutSegment, FitFirst, FitNext, PatchBackdrop, PatchBackground, background_of
     from tasks.stages.footage import Take
     from tasks.stages.plan import Plan
+    from tasks.stages.track import PATCHES, ChooseDatedKeyframes
 
     capture, found = find_capture(FOLDER / "capture"), Found()
     made: dict[str, str] = {}
@@ -127,6 +129,13 @@ def _measure_here() -> Found:
     with tempfile.TemporaryDirectory() as folder:
         store = Store(Path(folder) / capture.name / "store")
         site = Site(store.root, capture.folder, 1)
+
+        def plant(building: Any) -> Mapping[str, Any]:
+            """Most of each picture changes for good at instant 3, as nothing does in the tiny capture."""
+            mask = np.zeros((12, 16), bool)
+            mask[2:10, 2:14] = True
+            Patches((Patch(3, dict.fromkeys(range(4), mask)),)).save(building.out / PATCHES)
+            return {}
 
         def make(stage: Stage, site: Site = site) -> Key:
             def build(building: Any) -> Mapping[str, Any]:
@@ -159,6 +168,14 @@ def _measure_here() -> Found:
         elsewhere = replace(workshop, originals=Originals(find_capture(empty), memory))
         make(background_of(elsewhere, take, options.fit.background), replace(site, capture=empty))
         key, segment = sequence.made.keys["key"][0], sequence.made.keys["segment"][0]
+        planted = store.make("patches", 1, {"planted": 3}, {}, plant)
+        made[str(planted)] = _content(store.path(planted))
+        make(ChooseDatedKeyframes(motion=only("motion"), options=options.keyframes, patches=planted))
+        background, backdrop = only("background"), only("backdrop")
+        own = make(PatchBackground(take=take, background=background, patches=planted, epoch=0,
+                                   options=options.fit.background))  # fmt: skip
+        make(PatchBackdrop(take=take, previous=backdrop, before=background, after=own,
+                           options=options.fit.part(NextOptions), epoch=0))  # fmt: skip
         make(CutSegment(segment=segment, frames=2))
         make(FitFirst(take=take, instant=0, options=options.fit.part(FirstOptions)))  # this capture has a backdrop
         following = next(stage for stage in steps if isinstance(stage, FitNext))

@@ -11,10 +11,13 @@ from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
 from packuv.fit.start.points import Points, no_points, seen_colours
 from packuv.gaussians.codes import OPACITY_RANGE
-from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.floats import Gaussians, logit
 
 SH_BASE = 0.28209479177387814
 """Value of the constant spherical harmonic"""
+
+AIR_OPACITY = 0.1
+"""At the start of Gaussians in a volume, most of which is air"""
 
 _ROUNDS = 8
 """Draws of random places before fewer than asked for will do"""
@@ -33,8 +36,8 @@ class StartOptions:
     """Cameras that must see a random Gaussian; all of them in smaller rigs"""
     surface_share: float = 0.9
     """At most this share starts on surfaces: triangulated points and the shell; what is left fills the volume"""
-    opacity: float = 0.3
-    """Opacity of every Gaussian at the start"""
+    surface_opacity: float = 0.3
+    """Opacity at the start of Gaussians on surfaces"""
 
     def within(self, cap: int) -> StartOptions:
         """The same for so many Gaussians at most."""
@@ -62,13 +65,14 @@ def first_gaussians(
     xyz, rgb = (np.concatenate([getattr(surface, name), getattr(volume, name)]) for name in ("xyz", "rgb"))
     spacing = neighbour_distance(xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 2 * np.median(spacing))
-    return round_gaussians(xyz, rgb, scale, opacity=options.opacity, sh_degree=sh_degree)
+    opacity = np.repeat([options.surface_opacity, AIR_OPACITY], [len(surface.xyz), len(volume.xyz)])
+    return round_gaussians(xyz, rgb, scale, opacity=opacity, sh_degree=sh_degree)
 
 
 def round_gaussians(
-    xyz: np.ndarray, rgb: np.ndarray, scale: np.ndarray, *, opacity: float, sh_degree: int
+    xyz: np.ndarray, rgb: np.ndarray, scale: np.ndarray, *, opacity: float | np.ndarray, sh_degree: int
 ) -> Gaussians:
-    """Spheres at `xyz` [N, 3] with colours [N, 3] in [0, 1] and standard deviations [N], world."""
+    """Spheres at `xyz` [N, 3] with colours [N, 3] in [0, 1], standard deviations [N], world, and one opacity or [N]."""
     count = len(xyz)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (rgb - 0.5) / SH_BASE
@@ -76,7 +80,7 @@ def round_gaussians(
         means=xyz.astype(np.float32),
         log_scales=np.repeat(np.log(scale)[:, None], 3, axis=1).astype(np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        opacity_logits=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
+        opacity_logits=np.full(count, logit(np.asarray(opacity)), np.float32),
         sh=sh,
     )
 

@@ -96,7 +96,8 @@ class Shell:
         which cover smooth walls, and most of the others where the surface has detail."""
         sure, even = self._sure_points(round(SURE_SHARE * count), rng), self._cover(round(EVEN_SHARE * count))
         fine = self._detailed(count - len(sure.xyz) - len(even.xyz), rng)
-        return Points(*(np.concatenate([getattr(part, name) for part in (sure, even, fine)]) for name in ("xyz", "rgb")))
+        parts = (sure, even, fine)
+        return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
 
     def _sure_points(self, count: int, rng: np.random.Generator) -> Points:
         """At most `count` of the places that cameras agree on, evenly over the sphere."""

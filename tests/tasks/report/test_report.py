@@ -22,10 +22,10 @@ from calibration.accept import check_rig
 from calibration.rig import Camera, Rig
 from sync.align import CameraReport, SyncReport
 from sync.clock import Clock, ClockMode, ClockState
-from tasks.report.facts import MAX_PSNR_DB
+from tasks.report.facts import MAX_PSNR_DB, LastingChange
 from tasks.report.page import SECTIONS, duration, page_text
 from tasks.report.plots import Series, Volume, bar_chart, line_chart, rig_axes, rig_views
-from tasks.report.record import summary
+from tasks.report.record import report_json, summary
 from tasks.report.write import (
     Comparison,
     FrameScore,
@@ -107,7 +107,7 @@ def make_report() -> ReportInput:
         held_out=HELD_OUT,
         check=check_rig(rig),
         light=make_light(),
-        motion=MotionCurve(np.linspace(0, 2, FRAMES), (0, 7)),
+        motion=MotionCurve(np.linspace(0, 2, FRAMES), (0, 7), (LastingChange(7, ("cam0", "cam2")),)),
         scores=make_scores(),
         scene=make_scene(),
         pictures=(Comparison("cam1", 3, truth, truth, "first"),),
@@ -232,6 +232,7 @@ def test_names_and_reasons_stay_text_wherever_they_come_up() -> None:
         light=replace(make_light(), exposures={bad: make_light(2.0).exposures["cam2"]}, reason=bad),
         scores=tuple(replace(score, camera=bad) for score in report.scores[:FRAMES]),
         scene=replace(make_scene(), name=bad, verified=False, problem=bad),
+        motion=replace(report.motion, changes=(LastingChange(7, (bad,)),)),
         pictures=tuple(replace(item, camera=bad, choice=bad) for item in report.pictures),
         stages=tuple(
             StageRecord(bad, outcome, 1.0, reason=bad) for outcome in (StageOutcome.FAILED, StageOutcome.SKIPPED)
@@ -241,7 +242,7 @@ def test_names_and_reasons_stay_text_wherever_they_come_up() -> None:
     assert text.count("<script") == page_text(report).count("<script") == 1
     assert "&amp;lt;" not in text  # escaped once
     words = Page(text).words
-    for name in ("sync", "rig", "colour", "light", "quality", "pictures", "size", "stages", "skipped", "run"):
+    for name in ("sync", "rig", "colour", "light", "motion", "quality", "pictures", "size", "stages", "skipped", "run"):
         assert bad.replace(" ", "") in Page(section(text, name)).words.replace(" ", ""), name
     assert words.count(bad) > 20
 
@@ -253,6 +254,16 @@ def test_the_summary_row_shows_the_figures() -> None:
     assert "1 min 15 s" in words
     assert "cameras, 2 held out" in words
     assert f"{(900_000 * 2 + 50_000 * 10 + 12_345) / 1e6 * 30 / 12:.2f} MB" in words
+
+
+def test_lasting_changes_are_listed_and_a_cut_is_a_finding() -> None:
+    report = make_report()
+    assert "frame 7: cam0, cam2" in Page(page_text(report)).words
+    assert report_json(report)["motion"]["changes"] == [{"frame": 7, "cameras": ["cam0", "cam2"]}]
+    assert report.motion is not None
+    cut = replace(report, motion=replace(report.motion, cuts=(5,)))
+    assert any(item.section == "motion" and "frame 5" in item.text for item in findings(cut))
+    assert not any(item.section == "motion" for item in findings(report))
 
 
 # ---- report.json
@@ -267,7 +278,12 @@ def test_json_holds_the_numbers(tmp_path: Path) -> None:
     assert np.allclose(data["cameras"][0]["centre"], make_rig().cameras[0].centre)
     assert np.allclose(np.log(data["light"]["factors"]), make_light().light, atol=1e-5)
     assert data["light"]["exposures"].keys() == {"cam2"}
-    assert data["motion"] == {"magnitude_px": np.linspace(0, 2, FRAMES).tolist(), "keyframes": [0, 7]}
+    assert data["motion"] == {
+        "magnitude_px": np.linspace(0, 2, FRAMES).tolist(),
+        "keyframes": [0, 7],
+        "changes": [{"frame": 7, "cameras": ["cam0", "cam2"]}],
+        "cuts": [],
+    }
     assert data["scene"]["frame_bytes"] == list(make_scene().frame_bytes)
     assert data["summary"]["verified"] is True
     assert data["findings"] == [{"section": item.section, "text": item.text} for item in findings(report)]
