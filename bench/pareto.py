@@ -67,7 +67,7 @@ KNOBS: Mapping[str, Mapping[str, Pairs]] = {
     "iterations": _one("fit.iterations", 450, 1800),
     "frame_iterations": _one("fit.frame_iterations", 48),
     "settle": _one("fit.settle", 0.05, 0.02),
-    "key_iterations": _one("fit.key_iterations", 100, 400),
+    "key_iterations": _one("fit.key_iterations", 200, 800),
     "gaussians": {f"{cap}": (f"fit.density.cap={cap}", f"fit.start.count={cap * 7 // 10}") for cap in (30_000, 90_000)},
     "size": _one("pictures.max_width", 320),
     "tolerance": {str(quality): _tolerance(quality) for quality in (Quality.HIGH, Quality.LOW)},

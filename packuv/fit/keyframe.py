@@ -205,6 +205,8 @@ def fit_next(
     """
     started = time.monotonic()
     bounds, quantizer = previous.bounds, previous.quantizer
+    if previous.instant is None:
+        options = replace(options, rates=options.rates.faster(options.key_rate_scale))
     rng = np.random.default_rng([options.seed, instant, 1])
     model = Model(previous.foreground)
     solver = Solver(model, bounds, options, rng, previous.open_backdrop(options.device, views.budget))

@@ -26,6 +26,10 @@ class Rates:
     sh_base: float = 2.5e-3
     sh_rest: float = 1.25e-4
 
+    def faster(self, factor: float) -> Rates:
+        """The same, but means move so many times as far."""
+        return replace(self, means=factor * self.means)
+
     def columns(self, name: str, width: int, *, radius: float, progress: float) -> np.ndarray:
         """float [width]: rate of each column of an attribute's flattened row."""
         if name == "means":

@@ -116,6 +116,9 @@ class NextOptions(KeyframeOptions, ChangeOptions):
     """Gaussians born inside the hull of what differs from where the keyframe starts"""
     key_iterations: int = 500
     """Of each keyframe"""
+    key_rate_scale: float = 16.0
+    """Factor on the means' rate in keyframes that start from the backdrop: what is born in a hull has far to go. On
+    "basketball" 800 iterations leave moving areas of unseen cameras with 24.1 dB with 1, 25.1 with 4, 26.2 with 16"""
 
     def __post_init__(self) -> None:
         if self.key_iterations < 1:
