@@ -29,22 +29,22 @@ SETTLE_EXPONENT = -0.75
 """From 170 at 0.02 to 48 at 0.1"""
 
 SECONDS: Mapping[str, float] = {
-    "starts": 1.5,
-    "sync": 5.0e-4,
-    "rig and points": 6.2,
-    "light": 0.0168,
-    "flow": 0.057,
-    "background": 0.2,
-    "shell": 6.1,
-    "backdrop iterations": 3.8e-3,
-    "keyframes": 2.75,
-    "keyframe iterations": 1.4e-3,
-    "frames": 0.136,
-    "frame iterations": 1.4e-3,
-    "previews": 9.8,
-    "encode": 0.59,
-    "verify": 0.32,
-    "scores": 0.84,
+    "starts": 0.15,
+    "sync": 2.6e-4,
+    "rig and points": 1.8,
+    "light": 0.0106,
+    "flow": 0.045,
+    "background": 0.074,
+    "shell": 3.55,
+    "backdrop iterations": 3.2e-3,
+    "keyframes": 1.1,
+    "keyframe iterations": 1.25e-3,
+    "frames": 0.1,
+    "frame iterations": 8.3e-4,
+    "previews": 2.2,
+    "encode": 0.28,
+    "verify": 0.21,
+    "scores": 0.235,
 }
 """Of one unit of each kind of work, see `work_of`: "basketball", 24 cameras of 640x360, 150 frames"""
 STAGE_OF: Mapping[str, str] = {
