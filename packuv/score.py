@@ -95,10 +95,11 @@ def score(
         for frame in range(len(scene)):
             gaussians = scene.gaussians(frame, into=gaussians)
             for index, camera in enumerate(views.cameras):
-                if views.frames[frame, index] < 0:
+                truth = views.filmed(index, frame)
+                if truth is None:
                     continue
                 drawn = artist.draw(gaussians, camera)
-                shot = _Shot.of(views, index, frame, drawn, scene)
+                shot = _Shot.of(views, index, frame, truth, drawn, scene)
                 waiting.append(judges[index].submit(pool, shot))
                 while len(waiting) > AHEAD * workers:
                     scores.append(waiting.popleft().result())
@@ -114,6 +115,8 @@ class _Shot:
 
     frame: int
     time_ns: int
+    truth: np.ndarray
+    """float32 [3, H, W], as filmed"""
     seen: np.ndarray
     """float32 [3, H, W], in the scene's light of the instant"""
     shown: np.ndarray
@@ -122,11 +125,11 @@ class _Shot:
     """uint8 [H, W, 3], as the camera films it in steady light"""
 
     @classmethod
-    def of(cls, views: Views, camera: int, frame: int, drawn: np.ndarray, scene: Scene) -> _Shot:
+    def of(cls, views: Views, camera: int, frame: int, truth: np.ndarray, drawn: np.ndarray, scene: Scene) -> _Shot:
         shown = views.response(camera, frame).shown(drawn)
         steady = shown if views.light is None else views.response(camera, None).shown(drawn)
         seen = np.clip(lit(drawn, scene.light(frame)), 0, 1)
-        return cls(frame, int(scene.header.times_ns[frame]), seen, shown, as_pixels(steady))
+        return cls(frame, int(scene.header.times_ns[frame]), truth, seen, shown, as_pixels(steady))
 
 
 class _Judge:
@@ -144,9 +147,8 @@ class _Judge:
         return self._last
 
     def _score(self, shot: _Shot, before: Future[Score] | None) -> Score:
-        truth, filmed = (look(self._camera, shot.frame) for look in (self._views.filmed, self._views.steady))
-        assert truth is not None
-        assert filmed is not None
+        truth, filmed = shot.truth, self._views.steady(self._camera, shot.frame)
+        assert filmed is not None, "what has a picture as filmed has one in steady light"
         pictures = shot.seen, shot.shown, with_own_gain(shot.shown, truth)
         raw, calibrated, own = (
             (level if math.isfinite(level) else None, alike) for level, alike in likenesses(pictures, truth)

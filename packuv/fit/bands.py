@@ -82,9 +82,12 @@ def left_out(cameras: Sequence[PinholeCamera]) -> list[int]:
     count = max(LEAST_LEFT_OUT, round(len(cameras) / ONE_OF))
     chosen = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())]
     while len(chosen) < count:  # each the farthest from those before it
-        chosen.append(int(np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1).argmax()))
+        distance = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
+        if not distance.any():  # cameras in fewer places than that
+            break
+        chosen.append(int(distance.argmax()))
     group = np.linalg.norm(places[:, None] - places[chosen], axis=2).argmin(axis=1)
-    middles = (np.flatnonzero(group == number) for number in range(count))
+    middles = (np.flatnonzero(group == number) for number in range(len(chosen)))
     return sorted(int(rows[_middle(places[rows])]) for rows in middles)
 
 

@@ -215,7 +215,7 @@ def fit_next(
     masks = standing if previous.instant is None else _changes(views, previous.instant, instant, motion)
     shots = find_shots(views, instant, masks)
     if not shots:
-        return replace(previous, instant=instant, figures=figures_of(started, {}, solver))
+        return replace(previous, instant=instant, figures=figures_of(started, {}, solver) | _unjudged(previous))
     if previous.instant is not None:
         before = _standing(views, previous.instant, stills, motion)
         gone = inside(model.gaussians, views, before, bounds, options)
@@ -226,7 +226,7 @@ def fit_next(
     solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
     if not solver.rows.any():  # nothing that enough cameras see
-        figures = figures_of(started, {}, solver)
+        figures = figures_of(started, {}, solver) | _unjudged(previous)
         return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
     ticks, judgement, born_from = Ticks(progress, options.key_iterations), None, len(model)
     if quantizer.sh_degree:
@@ -236,6 +236,14 @@ def fit_next(
     solver.keep(~solver.rows | solver.worth_keeping())
     figures = figures_of(started, losses, solver) | ({} if judgement is None else {"sh": judgement.to_json()})
     return replace(previous, instant=instant, gaussians=_whole(previous, model), figures=figures)
+
+
+def _unjudged(previous: KeyState) -> dict[str, Any]:
+    """Figures of a keyframe in which nothing is fitted: before a backdrop, what comes into view later has no bands that
+    nobody judged."""
+    if previous.quantizer.sh_degree and previous.instant is None:
+        return {"sh": {"degree": 0}}
+    return {"sh": previous.figures["sh"]} if "sh" in previous.figures else {}
 
 
 def _judge_foreground(

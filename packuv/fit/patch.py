@@ -86,15 +86,16 @@ def fit_patch(
         Model(rows_of(previous.gaussians, loose)), bounds, replace(options, density=density), rng, backdrop=still
     )
     solver.fix(quantizer)
-    shots = [still_shot(views, after, index) for index in places]
-    seeing = [(shot, mask) for shot, mask in zip(shots, changed.values(), strict=True) if mask.any()]
+    # Others saw too little of it to have the median of these instants: there they show the state of the other time.
+    seeing = [(still_shot(views, after, index), mask) for index, mask in zip(places, changed.values(), strict=True)
+              if mask.any()]  # fmt: skip
     pictures = Each(lambda place: undone(seeing[place][0]), len(seeing))
     births = min(options.key_births, fresh // 2)  # the others where the first ones do not suffice
     cameras, seen = [shot.camera for shot, _ in seeing], [mask for _, mask in seeing]
     solver.append(born_in_hull(cameras, pictures, seen, bounds, options, rng, quantizer.sh_degree, births))
     if not len(solver.model):
         return previous
-    shots = tiled(shots, masks, solver, views)
+    shots = tiled([shot for shot, _ in seeing], masks, solver, views)
     losses = solver.run(shots, total, of=total, grow_from=len(solver.model), ticks=Ticks(progress, total))
     solver.keep(solver.worth_keeping())
     codes = quantizer.encode(solver.model.gaussians)

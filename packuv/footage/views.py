@@ -11,6 +11,7 @@ import base64
 import zlib
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -212,7 +213,9 @@ class Views:
             self._cache[key] = pixels
 
     def _put_aside(self, key: tuple[int, int], pixels: np.ndarray) -> None:
-        if self._spill is not None:
+        if self._spill is None:
+            return
+        with suppress(OSError):  # a full disk: the picture is decoded again
             self._spill.write(key, pixels)
 
 

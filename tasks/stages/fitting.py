@@ -375,7 +375,7 @@ def read_losses(folder: Path) -> list[float]:
 
 def _spared_bands(notes: Notes) -> Iterator[tuple[str, str]]:
     """View dependence that was asked for and is not carried, and on what evidence."""
-    if "sh" in notes and notes["sh"]["degree"] < notes["sh"]["asked"]:
+    if notes.get("sh", {}).get("degree", 0) < notes.get("sh", {}).get("asked", 0):
         yield "view dependence", told(notes["sh"])
 
 

@@ -149,3 +149,7 @@ def test_cameras_left_out_are_spread_over_the_rig(ring, count, expected):
     evenly = np.linspace(0, count, expected, endpoint=False).astype(int)
     best = np.linalg.norm(places[:, None] - places[evenly], axis=2).min(axis=1).max()
     assert far <= 2 * best  # farthest-point choices are within a factor of two of the best cover
+
+
+def test_cameras_in_one_place_have_one_judge(ring):
+    assert len(bands.left_out([ring(12)[0]] * 12)) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import resource
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -211,6 +212,19 @@ def test_what_does_not_fit_into_memory_is_read_from_disk_instead_of_decoded_agai
         with pytest.raises(FileNotFoundError):
             views.pixels(0, 0)
     assert not list(tmp_path.iterdir())  # the files have no names
+
+
+def test_a_disk_without_room_for_pictures_has_them_decoded_again(video: Path, tmp_path: Path) -> None:
+    frames = np.arange(4)[:, None]
+    expected = [Views({"a": video}, frames, [LensCamera(camera())]).pixels(0, instant) for instant in range(4)]
+    views = Views({"a": video}, frames, [LensCamera(camera())], budget=Budget(0), spill=tmp_path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))  # less than a picture
+    try:
+        for instant in (0, 3, 0, 1, 2):
+            np.testing.assert_array_equal(views.pixels(0, instant), expected[instant])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_steady_pictures_undo_the_light_of_the_instant(video: Path) -> None:
