@@ -287,8 +287,8 @@ def with_earlier(rows: Sequence[dict[str, Any]], known: Sequence[dict[str, Any]]
     """What is there now, then what the file had beside it: of other knobs, or not yet found again."""
     named = {(row["knob"], row["value"]) for row in rows}
     base = rows[0]["request"]
-    same = ("frames", "seed", "preset", "scored")
-    others = [row for row in known if all(row["request"][name] == base[name] for name in same)]
+    same = ("capture", "frames", "seed", "preset", "scored", "common", "program")
+    others = [row for row in known if all(row["request"].get(name) == base[name] for name in same)]
     return list(chain(rows, (row for row in others if (row["knob"], row["value"]) not in named)))
 
 

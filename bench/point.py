@@ -18,11 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from packuv.kernels.simd import cpu_description
+from pipelines.batch.plan import program_digest
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
+from pipelines.options import compose
 from pipelines.process import Engine, Outcome, find_sequence, jobs_at_once, jobs_of, prepare, process
 from pipelines.request import PRESETS, Preset, RunRequest, parse_range, read_settings
-from tasks.artefacts.recipe import plain
+from sync.capture import CaptureSettings
+from tasks.artefacts.recipe import digest, plain
 from tasks.artefacts.store import WORK, Receipt, Store
 from tasks.stages.evaluate import METRICS
 
@@ -159,10 +162,12 @@ def _error(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 def _cost(receipts: Mapping[str, Receipt]) -> dict[str, Any]:
     by_stage: dict[str, dict[str, float]] = {}
+    if old := [name for name, receipt in receipts.items() if receipt.cpu_seconds is None]:
+        raise ValueError(f"costs need CPU seconds, but {old[0]} was made before they were noted; take a new --work")
     for name, receipt in receipts.items():
         stage = by_stage.setdefault(name.partition("/")[0], {"seconds": 0.0, "cpu_seconds": 0.0})
         stage["seconds"] = round(stage["seconds"] + receipt.seconds, 2)
-        stage["cpu_seconds"] = round(stage["cpu_seconds"] + (receipt.cpu_seconds or 0.0), 2)
+        stage["cpu_seconds"] = round(stage["cpu_seconds"] + (receipt.cpu_seconds or 0), 2)
     made = [stage for stage in by_stage if stage != SCORING]
 
     def together(stages: list[str], what: str) -> float:
@@ -181,7 +186,15 @@ def _cost(receipts: Mapping[str, Receipt]) -> dict[str, Any]:
 
 
 def request_of(base: Base, settings: tuple[str, ...], unseen: tuple[str, ...] = ()) -> dict[str, Any]:
-    """What tells a point from others, whichever folder it runs in."""
-    asked: dict[str, Any] = plain(base.request(settings, unseen))
-    scored = list(base.scored())
-    return {"scored": scored, **{name: value for name, value in asked.items() if name not in ("out", "capture")}}
+    """What tells a point from others, whichever folder it runs in, and the program and what presets mean."""
+    request = base.request(settings, unseen)
+    asked: dict[str, Any] = plain(request)
+    options = compose(request.preset, CaptureSettings(), request.settings, seed=request.seed, quality=request.quality)
+    return {
+        "capture": base.capture.name,
+        "scored": list(base.scored()),
+        "common": list(base.settings),
+        "options": digest(plain(options))[:16],
+        "program": program_digest(),
+        **{name: value for name, value in asked.items() if name not in ("out", "capture")},
+    }

@@ -91,7 +91,7 @@ def run(base: Base, names: Sequence[str], known: Sequence[Mapping[str, Any]]) ->
     rows = {json.dumps(row["request"], sort_keys=True): row for row in known}
 
     def figures(settings: tuple[str, ...]) -> dict[str, Any]:
-        request = {"capture": base.capture.name, **request_of(base, settings)}
+        request = request_of(base, settings)
         name = json.dumps(request, sort_keys=True)
         if name not in rows:
             rows[name] = {**measure(base, settings)[0], "request": request}

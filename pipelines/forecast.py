@@ -146,7 +146,8 @@ def pilot_minutes(size: Size, options: SequenceOptions, machine: Machine, frames
     whole, short = work_of(size, options), work_of(Size(frames, size.fitted, size.held_out), options)
     few = (*PER_SEGMENT, "encode", "scores")
     work = {kind: short[kind] if kind in few else whole[kind] for kind in whole if kind not in ("verify", "previews")}
-    return sum(SECONDS[kind] * value / _speed(kind, size, Machine(machine.cores)) for kind, value in work.items()) / 60
+    first = Size(frames, size.fitted, size.held_out)
+    return sum(SECONDS[kind] * value / _speed(kind, first, machine) for kind, value in work.items()) / 60
 
 
 def expected_iterations(options: SequenceOptions) -> float:
@@ -163,6 +164,6 @@ def _pixels(width: int, height: int, options: SequenceOptions) -> float:
 def _speed(kind: str, size: Size, machine: Machine) -> float:
     """Of the machine, in that of the measured one. Never more segments at once than there are."""
     threads = max(1, machine.cores // machine.jobs)
-    at_once = min(machine.jobs, max(1.0, size.frames / SEGMENT)) if kind in PER_SEGMENT else 1.0
+    at_once = min(machine.jobs, machine.cores, max(1.0, size.frames / SEGMENT)) if kind in PER_SEGMENT else 1.0
     speed: float = at_once * (threads / REFERENCE_CORES) ** CORES_EXPONENT
     return speed

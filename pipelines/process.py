@@ -222,7 +222,13 @@ def settle(sequence: Sequence, run: Run, engine: Engine, affordable: Affordable)
     for point in affordable:
         pilot, _ = prepared(point)
         scores = pilot.workshop.path(pilot.pilot(PILOT_FRAMES)) / METRICS
-        tried[point.name] = json.loads(scores.read_text())["mean"]["psnr_calibrated_db"]
+        level = json.loads(scores.read_text())["mean"]["psnr_calibrated_db"]
+        if level is None:
+            raise ValueError(
+                f"a target for PSNR is judged by the first {PILOT_FRAMES} frames, but no camera held out filmed them; "
+                "hold out another one, or begin later with --frames"
+            )
+        tried[point.name] = level
         run.journal.told(
             "pilot", f"{point.name}: {tried[point.name]:.2f} dB in the first frames, {target:g} are asked for"
         )
@@ -255,7 +261,10 @@ def prepare(
     originals = Originals(capture, folder / "file_digests.json")
     workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
     lender = lender_of(request, capture, workshop, engine.submitter)
-    sequence = Sequence(workshop, plan, options, engine.submitter(workshop.make), Made(), lender, engine.watched)
+    # Points are judged alike: small pictures score higher.
+    judged = options_of(request, capture, request.preset).pictures if request.target_psnr is not None else None
+    submit = engine.submitter(workshop.make)
+    sequence = Sequence(workshop, plan, options, submit, Made(), lender, engine.watched, judged)
     return sequence, Run(folder.name, request, options, plan, workshop, journal, started, sequence.made, choice)
 
 

@@ -18,7 +18,7 @@ from prefect.flows import Flow
 from prefect.logging.handlers import APILogWorker, PrefectConsoleHandler
 from prefect.runtime import flow_run
 from prefect.settings import PREFECT_API_URL
-from prefect.states import Cancelled, Crashed
+from prefect.states import Cancelled, Crashed, Failed
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from pipelines.dashboard import Dashboard, run_tags
@@ -35,9 +35,13 @@ SequenceFlow = Flow[[RunRequest], Outcome]
 
 
 def sequence_flow(
-    journal: Callable[[], Journal], link: Callable[[], Link], jobs: Callable[[RunRequest], Jobs] = jobs_of
+    journal: Callable[[], Journal],
+    link: Callable[[], Link],
+    jobs: Callable[[RunRequest], Jobs] = jobs_of,
+    ended: Callable[[Outcome], object] = lambda outcome: None,
 ) -> SequenceFlow:
-    """The flow; each of its runs has a journal, a link to the server and jobs of its own."""
+    """The flow; each of its runs has a journal, a link to the server and jobs of its own. `ended` hears what came out,
+    also of a run that counts as failed because it misses what was asked for."""
 
     @flow(name="sequence", flow_run_name=_run_name, persist_result=False)
     def process_sequence(request: RunRequest) -> Any:
@@ -46,20 +50,25 @@ def sequence_flow(
         Args:
             request: Which capture, where to, and how.
         """
-        return _process(request, journal(), link(), jobs(request))
+        outcome = _process(request, journal(), link(), jobs(request))
+        if isinstance(outcome, State):
+            return outcome
+        ended(outcome)
+        return Failed(message=outcome.missed) if outcome.missed else outcome
 
     return process_sequence
 
 
 def run_flow(request: RunRequest, journal: Journal, link: Link) -> Outcome:
     """Run the flow here. Raises what `process` raises."""
-    state: State[Outcome] = sequence_flow(lambda: journal, lambda: link)(request, return_state=True)
+    ended = list[Outcome]()
+    sequence = sequence_flow(lambda: journal, lambda: link, ended=ended.append)
+    state: State[Outcome] = sequence(request, return_state=True)
     send_what_is_left()
     link.close()
     if state.is_cancelled():
         raise CancelledError(state.message)
-    outcome: Outcome = state.result()
-    return outcome
+    return ended[0] if ended else state.result()
 
 
 def send_what_is_left() -> None:

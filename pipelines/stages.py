@@ -76,6 +76,8 @@ class Sequence:
     """The take whose rig this one uses"""
     watched: bool = False
     """Somebody may look at pictures of what is fitted before all is"""
+    judged: PictureOptions | None = None
+    """How large the pictures are on which scores are measured; None: as those that are fitted"""
 
     def run(self, stop_after: str) -> None:
         """Have every artefact up to the stage `stop_after`, noting each in `made`.
@@ -104,7 +106,7 @@ class Sequence:
         self.made.add(*self._chain(spans).pilot(first))
         scene = self.encoded()
         self._make(replace(scene, take=replace(scene.take, stop=self.plan.first + first.stop)))
-        return self.score(self.plan.held_out, self.options.pictures)
+        return self.score(self.plan.held_out, self.judged or self.options.pictures)
 
     def encoded(self) -> Encode:
         """The scene file of the segments that are there."""
@@ -255,7 +257,7 @@ class Sequence:
         if not self.plan.held_out:
             why = f"no camera is held out; scored on fitted {', '.join(cameras)}"
             self.workshop.listener.skipped("unseen scores", why)
-        self.score(cameras, self.options.pictures)
+        self.score(cameras, self.judged or self.options.pictures)
 
     def score(self, cameras: tuple[str, ...], pictures: PictureOptions) -> Key:
         """Scores of the scene on these cameras, against pictures of this size; noted in `made`, as in a run."""

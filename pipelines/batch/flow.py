@@ -126,7 +126,7 @@ def _run_sequence(
 ) -> Outcome:
     """Run the flow of a sequence as a subflow. Raises what `process` raises."""
     # When the server has gone, every sequence ends by itself, and the batch ends the process when all have.
-    link = Link(died=died, last_word=lambda sentence: None)
+    link, ended = Link(died=died, last_word=lambda sentence: None), list[Outcome]()
     with ExitStack() as starting:
         # One after another: the engine numbers subflows without a lock, and takes one number for one run.
         starting.enter_context(starts)
@@ -136,13 +136,13 @@ def _run_sequence(
             return journal
 
         try:
-            state: State[Outcome] = sequence_flow(begun, lambda: link, lambda _: jobs)(request, return_state=True)
+            sequence = sequence_flow(begun, lambda: link, lambda _: jobs, ended.append)
+            state: State[Outcome] = sequence(request, return_state=True)
         finally:
             link.close()
     if state.is_cancelled():
         raise CancelledError(state.message)
-    outcome: Outcome = state.result()
-    return outcome
+    return ended[0] if ended else state.result()
 
 
 def _run_name() -> str:

@@ -82,9 +82,11 @@ class Batch:
         self._table = ResultTable(request.table)
         self._table.check()
         steps = self._plan.to_run
-        self.at_once = min(request.at_once or _default_at_once(), max(1, len(steps)))
+        wide = request.at_once or _default_at_once()
+        self.at_once = min(wide, max(1, len(steps)))
         """Sequences at a time"""
-        self._cores = max(1, cores_of() // self.at_once)
+        # With a time limit the cores decide what is fitted, so they must not depend on how many sequences are left.
+        self._cores = max(1, cores_of() // (self.at_once if request.max_minutes is None else wide))
         self._pace = Pace(_earlier(self._plan))
         self._headway = Headway(time.monotonic(), self._pace, self.at_once)
         self._started = datetime.now(UTC)

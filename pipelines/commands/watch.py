@@ -132,7 +132,7 @@ def _ended(folder: Path, run: Mapping[str, Any]) -> Standing:
     return Standing(
         sequence=run["sequence"],
         state=run["outcome"],
-        preset=run["request"]["preset"],
+        preset=(run.get("choice") or {}).get("point") or run["request"]["preset"],
         doing=run["reason"],
         seconds=_seconds(run["started"], run["finished"]),
         psnr_db=figures.get("psnr_db"),

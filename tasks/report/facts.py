@@ -211,8 +211,10 @@ class Choice:
     @property
     def missed(self) -> str:
         """By how much the target is missed; empty where it is reached, or none was set."""
-        if self.target_psnr is None or self.psnr_db is None or self.psnr_db >= self.target_psnr:
+        if self.target_psnr is None or (self.psnr_db is not None and self.psnr_db >= self.target_psnr):
             return ""
+        if self.psnr_db is None:
+            return f"The target of {self.target_psnr:g} dB is missed: no frame has a score."
         tried = ", ".join(f"{point} {level:.2f}" for point, level in self.pilots.items())
         return (
             f"The target of {self.target_psnr:g} dB is missed: {self.point} reaches {self.psnr_db:.2f} dB "
