@@ -158,7 +158,7 @@ def test_files_that_cannot_be_written_cost_one_sentence_and_no_artefact(undistur
 def test_a_whole_run_has_all_its_files(tmp_path, monkeypatch, capsys, lost):
     def ends(request, journal, *, direct):
         class Outcome:
-            folder = tmp_path
+            folder, missed = tmp_path, ""
 
             def farewell(self) -> str:
                 return "done"
