@@ -7,7 +7,6 @@ from typing import Generic, TypeVar, overload
 
 import numpy as np
 
-Thing = TypeVar("Thing")
 Item = TypeVar("Item", covariant=True)
 
 

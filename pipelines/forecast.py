@@ -143,10 +143,10 @@ def forecast_minutes(size: Size, options: SequenceOptions, machine: Machine, sto
 
 def pilot_minutes(size: Size, options: SequenceOptions, machine: Machine, frames: int) -> float:
     """Minutes of a pilot of so many frames: all before the fits, the backdrop, a keyframe and its frames, scored."""
-    whole, short = work_of(size, options), work_of(Size(frames, size.fitted, size.held_out), options)
+    first = Size(frames, size.fitted, size.held_out)
+    whole, short = work_of(size, options), work_of(first, options)
     few = (*PER_SEGMENT, "encode", "scores")
     work = {kind: short[kind] if kind in few else whole[kind] for kind in whole if kind not in ("verify", "previews")}
-    first = Size(frames, size.fitted, size.held_out)
     return sum(SECONDS[kind] * value / _speed(kind, first, machine) for kind, value in work.items()) / 60
 
 

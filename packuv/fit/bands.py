@@ -7,7 +7,6 @@ compared on cameras that took no part; from then on all cameras do.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +17,8 @@ from packuv.camera import PinholeCamera
 from packuv.fit.losses import PhotometricOptions, photometric_loss
 from packuv.fit.shots import Shot
 from packuv.fit.solver import Solver
+from packuv.metrics import decibels
+from packuv.raster.view import pixels_of_tiles
 
 ONE_OF = 6
 """Cameras, of which one is left out"""
@@ -143,7 +144,7 @@ def _error(solver: Solver, shots: Sequence[Shot], options: PhotometricOptions) -
         wanted = shot.wanted(picture)
         losses.append(photometric_loss(picture, wanted, options=options, tiles=shot.tiles).value)
         square = np.square(picture.clip(0, 1) - wanted)
-        psnr_db.append(-10 * math.log10(max(float(square[:, _counted(shot)].mean()), 1e-10)))
+        psnr_db.append(decibels(max(float(square[:, _counted(shot)].mean()), 1e-10)))
     return float(np.mean(losses)), float(np.mean(psnr_db))
 
 
@@ -152,7 +153,7 @@ def _counted(shot: Shot) -> np.ndarray:
     size = shot.camera.height, shot.camera.width
     counted = np.ones(size, bool) if shot.certain is None else shot.certain.copy()
     if shot.tiles is not None:
-        counted &= np.kron(shot.tiles, np.ones((16, 16), bool))[: size[0], : size[1]]
+        counted &= pixels_of_tiles(shot.tiles, shot.camera)
     return counted if counted.any() else np.ones(size, bool)
 
 

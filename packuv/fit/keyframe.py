@@ -35,7 +35,7 @@ from packuv.fit.solver import Losses, Solver, tiled
 from packuv.fit.start.bounds import Bounds, find_bounds
 from packuv.fit.start.first import AIR_OPACITY, first_gaussians, neighbour_distance, round_gaussians
 from packuv.fit.start.hull import hull_points, in_hull
-from packuv.fit.start.points import Points, drawn, no_points
+from packuv.fit.start.points import Points, drawn, no_points, together
 from packuv.fit.start.shell import Shell, sweep_shell
 from packuv.footage import Views, as_planes
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Quantizer, attribute_values
@@ -327,10 +327,8 @@ def _surface(shell: Shell | None, points: Points | None, options: FirstOptions) 
     """Where surfaces are: sparse points, and the shell."""
     start, rng = options.start, np.random.default_rng([options.seed, 3])
     room = round(start.count * start.surface_share)
-    parts = [no_points()] if points is None else [drawn(points, room // 2, rng)]
-    if shell is not None:
-        parts.append(shell.places(room - len(parts[0].xyz), rng))
-    return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
+    sparse = no_points() if points is None else drawn(points, room // 2, rng)
+    return sparse if shell is None else together(sparse, shell.places(room - len(sparse.xyz), rng))
 
 
 def choose_quantizer(gaussians: Gaussians, bounds: Bounds, sh_degree: int) -> Quantizer:

@@ -13,7 +13,7 @@ from packuv.fit.backdrop import Backdrop
 from packuv.fit.density import ScreenGradient, grow, prune, relocate
 from packuv.fit.guard import Guard
 from packuv.fit.labels import active_tiles
-from packuv.fit.model import Model
+from packuv.fit.model import Model, Rates
 from packuv.fit.options import FrameOptions, SolverOptions
 from packuv.fit.shots import Shot
 from packuv.fit.start.bounds import Bounds
@@ -181,7 +181,7 @@ class Solver:
         near = options.near_key * usual
         while done < limit and not (gains and np.mean(gains[-2:]) < options.settle and _total(losses) <= near):
             count = min(max(len(shots), _ROUND), limit - done)
-            fresh, done = self._round(shots, count, options.frame_rate_scale), done + count
+            fresh, done = self._round(shots, count, options.rates.faster(options.frame_rate_scale)), done + count
             if both := sorted(losses.keys() & fresh.keys()):
                 before, now = (np.array([sum(part[shot].values()) for shot in both]) for part in (losses, fresh))
                 gains.append((before - now).mean() / max(before.mean(), _GREY))
@@ -199,12 +199,12 @@ class Solver:
                 self._start_afresh()
         return (mean_losses([losses[shot] for shot in sorted(losses)]) if losses else None), done
 
-    def _round(self, shots: Sequence[Shot], count: int, rate_scale: float) -> dict[int, Losses]:
+    def _round(self, shots: Sequence[Shot], count: int, rates: Rates) -> dict[int, Losses]:
         """`count` iterations of a frame; the last losses of each shot that was drawn whole, by its index."""
         losses: dict[int, Losses] = {}
         for _ in range(count):
             index, near = self._next(shots), self._near()
-            found = self._iterate(shots, index, near, progress=0.0, scale=rate_scale)
+            found = self._iterate(shots, index, near, progress=0.0, rates=rates)
             if near == self.bounds.near:
                 losses[index] = found
         return losses
@@ -222,7 +222,7 @@ class Solver:
         near: float,
         *,
         progress: float,
-        scale: float = 1.0,
+        rates: Rates | None = None,
         opaque: bool = False,
     ) -> Losses:
         options, shot = self._options, shots[index].opened()
@@ -249,7 +249,7 @@ class Solver:
         for pull in found.values():
             for name, gradient in pull.gaussians.items():
                 values[name] = values[name] + gradient
-        self.model.step(values, options.rates, radius=self.bounds.radius * scale, progress=progress, rows=moving)
+        self.model.step(values, rates or options.rates, radius=self.bounds.radius, progress=progress, rows=moving)
         self._guard.check(self.model, values, moving, f"camera {shot.camera.name!r}, iteration {self.done}")
         self._overflown += drawn.overflow_count
         self.done += 1

@@ -128,11 +128,22 @@ class Stills(Sequence[Still]):
 
 def _still(camera: int, pictures: np.ndarray, options: BackgroundOptions) -> Still:
     """`pictures` is uint8 [n, H, W, 3]."""
-    middle = len(pictures) // 2
-    median = np.partition(pictures, middle, axis=0)[middle]
+    median = median_of(pictures)
     needed = options.agreement * len(pictures)
     near = np.zeros(median.shape[:2], np.int32)
     for picture in pictures:
-        difference = np.maximum(picture, median) - np.minimum(picture, median)
-        near += (difference <= options.tolerance).all(axis=2)
+        near += apart(picture, median) <= options.tolerance
     return Still(camera, median, near >= needed)
+
+
+def median_of(pictures: np.ndarray) -> np.ndarray:
+    """The upper median along the first axis, uint8 [...] of [n, ...]."""
+    middle = len(pictures) // 2
+    return np.asarray(np.partition(pictures, middle, axis=0)[middle])
+
+
+def apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Largest difference of a channel, uint8 [...] of [..., 3]."""
+    difference = np.maximum(first, second) - np.minimum(first, second)
+    largest: np.ndarray = np.maximum(np.maximum(difference[..., 0], difference[..., 1]), difference[..., 2])
+    return largest

@@ -17,6 +17,7 @@ import numpy as np
 
 from packuv.files import save_npz
 from packuv.footage import Views
+from packuv.motion.background import apart, median_of
 from packuv.motion.step import fitted_size
 from packuv.progress import Progress, no_progress
 
@@ -159,9 +160,9 @@ def _camera_changes(views: Views, camera: int, instants: np.ndarray, window: int
     if there.sum() < window:
         return _Changes(splits, states)
     found = np.stack([picture for picture in pictures if picture is not None])
-    usual = np.partition(found, len(found) // 2, axis=0)[len(found) // 2]
+    usual = median_of(found)
     away = options.contrast - 2 * options.tolerance
-    other = sum((_apart(picture, usual) >= away).astype(np.int16) for picture in found)
+    other = sum((apart(picture, usual) >= away).astype(np.int16) for picture in found)
     open_places = np.asarray(other >= window // 2)  # the rest has one state throughout
     states[:] = usual
     places = np.zeros((len(pictures), int(open_places.sum()), 3), np.uint8)
@@ -182,13 +183,13 @@ def _dated_places(
     for first in range(count - window + 1):
         part = shown[first : first + window][there[first : first + window]]
         if len(part) >= enough:
-            states[first] = np.partition(part, len(part) // 2, axis=0)[len(part) // 2]
-            steady[first] = sum((_apart(picture, states[first]) <= options.tolerance) for picture in part)
+            states[first] = median_of(part)
+            steady[first] = sum((apart(picture, states[first]) <= options.tolerance) for picture in part)
     score = np.zeros(shown.shape[:2], np.int16)
     for split in range(window, count - window + 1):
         before, after = steady[split - window], steady[split]
         real = (before >= enough) & (after >= enough)
-        real &= _apart(states[split - window], states[split]) >= options.contrast
+        real &= apart(states[split - window], states[split]) >= options.contrast
         score[split] = np.where(real, before + after, 0)
     return _peaks(score, window), states
 
@@ -200,13 +201,6 @@ def _small(views: Views, camera: int, instant: int, width: int) -> np.ndarray | 
         return None
     size = fitted_size(pixels.shape[1], pixels.shape[0], width)
     return pixels if size == pixels.shape[1::-1] else cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-
-
-def _apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Largest difference of a channel, uint8 [...] of [..., 3]."""
-    apart = np.maximum(first, second) - np.minimum(first, second)
-    largest: np.ndarray = np.maximum(np.maximum(apart[..., 0], apart[..., 1]), apart[..., 2])
-    return largest
 
 
 def _peaks(score: np.ndarray, reach: int) -> np.ndarray:
@@ -253,7 +247,7 @@ def _region(part: _Changes, split: int, window: int, options: PatchOptions) -> n
     still = np.asarray(part.splits[max(0, split - 1) : split + 2].any(axis=0))
     if not still.any():
         return still
-    other = _apart(part.states[split - window], part.states[split]) >= options.contrast
+    other = apart(part.states[split - window], part.states[split]) >= options.contrast
     count, labels, stats, _ = cv2.connectedComponentsWithStats((other | still).astype(np.uint8), connectivity=8)
     own, area = np.bincount(labels[still], minlength=count), stats[:, cv2.CC_STAT_AREA]
     whole = (own >= max(LEAST_PIXELS, options.least_area * still.size)) & (own >= options.still_share * area)

@@ -20,7 +20,7 @@ from torch import Tensor
 from packuv.camera import PinholeCamera
 from packuv.gaussians.floats import Gaussians, arrays
 from packuv.raster.picture import Composed, Gradients, RasterOptions, checked_tiles
-from packuv.raster.view import MAX_COLOUR, MAX_LENGTH, MAX_LOG_SCALE, TILE, VIEW_NEAR, view_constants
+from packuv.raster.view import MAX_COLOUR, MAX_LENGTH, MAX_LOG_SCALE, TILE, VIEW_NEAR, pixels_of_tiles, view_constants
 
 _FAR = 1e10
 
@@ -224,8 +224,7 @@ def _composed(values: Tensor, alpha: Tensor, mask: Tensor, background: Any) -> t
 def _pixel_mask(tiles: np.ndarray | None, camera: PinholeCamera, device: torch.device) -> Tensor:
     """1 in active tiles, 0 elsewhere, [H, W]."""
     active = checked_tiles(tiles, camera).astype(np.float32)
-    mask = active.repeat(TILE, axis=0).repeat(TILE, axis=1)[: camera.height, : camera.width]
-    return torch.as_tensor(np.ascontiguousarray(mask), device=device)
+    return torch.as_tensor(np.ascontiguousarray(pixels_of_tiles(active, camera)), device=device)
 
 
 def _weights(scene: dict[str, Tensor], camera: PinholeCamera, options: RasterOptions, mask: Tensor) -> Tensor:

@@ -20,6 +20,11 @@ VIEW_CENTRE, VIEW_WIDTH, VIEW_HEIGHT = 16, 19, 20
 VIEW_SLOPES, VIEW_NEAR, VIEW_LOW_PASS = 21, 25, 26
 
 
+def pixels_of_tiles(tiles: np.ndarray, camera: PinholeCamera) -> np.ndarray:
+    """Each tile's value, [tiles_y, tiles_x], in all of its pixels, [H, W]."""
+    return tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[: camera.height, : camera.width]
+
+
 def view_constants(camera: PinholeCamera, near: float, low_pass_px2: float) -> np.ndarray:
     """Everything the kernels need to know of a camera, float64 [27]."""
     width, height = camera.width, camera.height

@@ -9,7 +9,7 @@ import numpy as np
 
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
-from packuv.fit.start.points import Points, no_points, seen_colours
+from packuv.fit.start.points import Points, no_points, seen_colours, together
 from packuv.gaussians.codes import OPACITY_RANGE
 from packuv.gaussians.floats import Gaussians, logit
 
@@ -62,11 +62,11 @@ def first_gaussians(
     rng = np.random.default_rng(seed)
     surface = no_points() if surface is None else surface
     volume = _random_points(cameras, pictures, bounds, options, max(0, options.count - len(surface.xyz)), rng)
-    xyz, rgb = (np.concatenate([getattr(surface, name), getattr(volume, name)]) for name in ("xyz", "rgb"))
-    spacing = neighbour_distance(xyz.astype(np.float32))
+    points = together(surface, volume)
+    spacing = neighbour_distance(points.xyz.astype(np.float32))
     scale = np.clip(spacing, 1e-4 * bounds.radius, 2 * np.median(spacing))
     opacity = np.repeat([options.surface_opacity, AIR_OPACITY], [len(surface.xyz), len(volume.xyz)])
-    return round_gaussians(xyz, rgb, scale, opacity=opacity, sh_degree=sh_degree)
+    return round_gaussians(points.xyz, points.rgb, scale, opacity=opacity, sh_degree=sh_degree)
 
 
 def round_gaussians(

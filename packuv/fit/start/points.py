@@ -24,6 +24,11 @@ def no_points() -> Points:
     return Points(np.empty((0, 3)), np.empty((0, 3)))
 
 
+def together(*parts: Points) -> Points:
+    """The points of all parts, in this order."""
+    return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
+
+
 def drawn(points: Points, count: int, rng: np.random.Generator, *, weight: np.ndarray | None = None) -> Points:
     """At most `count` of the points, at random, in proportion to `weight` [P] if given."""
     if len(points.xyz) <= count:

@@ -19,7 +19,7 @@ from numba import prange
 from packuv.camera import PinholeCamera
 from packuv.fit.depth import SparseDepth
 from packuv.fit.start.bounds import Bounds
-from packuv.fit.start.points import Points, drawn, pixels_of
+from packuv.fit.start.points import Points, drawn, pixels_of, together
 from packuv.kernels.compile import kernel, prefer_tbb
 from packuv.raster import ewa
 from packuv.raster.view import VIEW_CX, VIEW_CY, VIEW_FX, VIEW_FY, VIEW_HEIGHT, VIEW_NEAR, VIEW_WIDTH, view_constants
@@ -95,9 +95,7 @@ class Shell:
         """About `count` places of the surface: some that cameras agree on, some evenly over the rest of what is seen,
         which cover smooth walls, and most of the others where the surface has detail."""
         sure, even = self._sure_points(round(SURE_SHARE * count), rng), self._cover(round(EVEN_SHARE * count))
-        fine = self._detailed(count - len(sure.xyz) - len(even.xyz), rng)
-        parts = (sure, even, fine)
-        return Points(np.concatenate([part.xyz for part in parts]), np.concatenate([part.rgb for part in parts]))
+        return together(sure, even, self._detailed(count - len(sure.xyz) - len(even.xyz), rng))
 
     def _sure_points(self, count: int, rng: np.random.Generator) -> Points:
         """At most `count` of the places that cameras agree on, evenly over the sphere."""
