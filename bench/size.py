@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import os
 import platform
 import subprocess
@@ -163,7 +164,8 @@ def options_of(case: Case) -> FitOptions:
         # All on the shell: as thin as what is fitted long, where balls that fill the room overlap ten times as much.
         start=StartOptions(count=case.gaussians, surface_share=1.0),
         shell=ShellOptions(steps=12),  # the sweep is no iteration; its memory does not depend on this
-        density=DensityOptions(cap=round(case.gaussians / 0.88), every=10**6),
+        # A backdrop may have 0.88 of the cap, and start with 0.8 of that.
+        density=DensityOptions(cap=math.ceil(case.gaussians / 0.88 / 0.8), every=10**6),
     )
 
 

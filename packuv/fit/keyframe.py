@@ -324,9 +324,9 @@ def _those(things: Sequence[np.ndarray | None], places: Sequence[int]) -> Each[n
 
 
 def _surface(shell: Shell | None, points: Points | None, options: FirstOptions) -> Points:
-    """Where surfaces are: sparse points, and the shell."""
+    """Where surfaces are: sparse points, and the shell as far as it explains the pictures."""
     start, rng = options.start, np.random.default_rng([options.seed, 3])
-    room = round(start.count * start.surface_share)
+    room = round(start.count * start.surface_share * (1 if shell is None else shell.explained))
     sparse = no_points() if points is None else drawn(points, room // 2, rng)
     return sparse if shell is None else together(sparse, shell.places(room - len(sparse.xyz), rng))
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from packuv.camera import PinholeCamera
+from packuv.each import Each
 from packuv.fit.start.bounds import Bounds
-from packuv.fit.start.points import Points, no_points, seen_colours, together
+from packuv.fit.start.points import Points, drawn, look, no_points, softened, together
 from packuv.gaussians.codes import OPACITY_RANGE
 from packuv.gaussians.floats import Gaussians, logit
 
@@ -22,6 +23,18 @@ AIR_OPACITY = 0.1
 _ROUNDS = 8
 """Draws of random places before fewer than asked for will do"""
 
+_CHOICE = 8
+"""Random places for each that a Gaussian starts from, the rather the better cameras agree on its colour"""
+
+AGREED = 0.05
+"""Deviation between cameras, of colours 0 to 1, beyond which a place is hardly on a surface"""
+
+_LEAST_WEIGHT = 1e-3
+"""Of places that cameras do not agree on, beside 1: what is hidden from one of them is a surface all the same"""
+
+_ROOM = 0.8
+"""Share of the cap that a fit may start with; the rest is for where detail turns out to be"""
+
 _CANDIDATES = 16
 """Neighbours among which float32 distances choose: more than the twelve that can be equally near on a lattice"""
 
@@ -29,19 +42,20 @@ _CANDIDATES = 16
 @dataclass(frozen=True)
 class StartOptions:
     count: int = 42_000
-    """Gaussians at the start, or as many as the cap allows"""
+    """Gaussians at the start, or four in five of what the cap allows"""
     volume: float = 1.25
     """Random Gaussians fill a ball of this many radii about the centre"""
     min_views: int = 3
     """Cameras that must see a random Gaussian; all of them in smaller rigs"""
     surface_share: float = 0.9
-    """At most this share starts on surfaces: triangulated points and the shell; what is left fills the volume"""
+    """Gaussians that start on surfaces, triangulated points and the shell, beside the share of the shell that cameras
+    agree on; what is left fills the volume"""
     surface_opacity: float = 0.3
     """Opacity at the start of Gaussians on surfaces"""
 
     def within(self, cap: int) -> StartOptions:
-        """The same for so many Gaussians at most."""
-        return replace(self, count=min(self.count, cap))
+        """The same for so many Gaussians at most in the end."""
+        return replace(self, count=min(self.count, round(_ROOM * cap)))
 
 
 def first_gaussians(
@@ -54,8 +68,8 @@ def first_gaussians(
     sh_degree: int,
     seed: int,
 ) -> Gaussians:
-    """Gaussians on the points of the surface and at random in the volume that several cameras see, `options.count`
-    together, coloured by the pictures.
+    """Gaussians on the points of the surface and in the volume that several cameras see, the rather where they agree,
+    `options.count` together, coloured by the pictures.
 
     Raises ValueError if no place is seen by enough cameras.
     """
@@ -101,20 +115,22 @@ def _random_points(
     rng: np.random.Generator,
 ) -> Points:
     needed = min(options.min_views, len(cameras))
-    xyz, rgb = np.empty((0, 3)), np.empty((0, 3))
+    soft = Each(lambda index: softened(pictures[index]), len(pictures))
+    found, weight = no_points(), np.empty(0)
     for _ in range(_ROUNDS if count else 0):
-        places = random_ball(rng, 4 * count) * options.volume * bounds.radius + bounds.centre
-        colours, views = seen_colours(cameras, pictures, places, bounds.near)
-        seen = views >= needed
-        xyz, rgb = np.concatenate([xyz, places[seen]]), np.concatenate([rgb, colours[seen]])
-        if len(xyz) >= count:
+        xyz = random_ball(rng, 4 * _CHOICE * count) * options.volume * bounds.radius + bounds.centre
+        sight = look(cameras, soft, xyz, bounds.near)
+        seen = sight.views >= needed
+        found = together(found, Points(xyz[seen], sight.rgb[seen]))
+        weight = np.append(weight, np.exp(-0.5 * np.square(sight.deviation[seen] / AGREED)) + _LEAST_WEIGHT)
+        if len(weight) >= _CHOICE * count:
             break
-    if count and not len(xyz):
+    if count and not len(weight):
         raise ValueError(
             f"no place within {options.volume} rig radii is seen by {needed} cameras; check the calibration: "
             "do the cameras look at a common volume?"
         )
-    return Points(xyz[:count], rgb[:count])
+    return drawn(found, count, rng, weight=weight)
 
 
 def random_ball(rng: np.random.Generator, count: int) -> np.ndarray:

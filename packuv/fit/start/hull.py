@@ -9,7 +9,7 @@ import numpy as np
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
 from packuv.fit.start.first import _ROUNDS, StartOptions
-from packuv.fit.start.points import Points, pixels_of, seen_colours
+from packuv.fit.start.points import Points, look, pixels_of
 
 
 def hull_points(
@@ -29,8 +29,7 @@ def hull_points(
         found = np.concatenate([found, xyz[in_hull(xyz, cameras, masks, bounds=bounds, options=options)]])
         if len(found) >= count or not len(xyz):
             break
-    rgb, _ = seen_colours(cameras, pictures, found[:count], bounds.near)
-    return Points(found[:count], rgb)
+    return Points(found[:count], look(cameras, pictures, found[:count], bounds.near).rgb)
 
 
 def in_hull(

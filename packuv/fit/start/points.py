@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from packuv.camera import PinholeCamera
+
+SOFT = 1.5
+"""Pixels that pictures are blurred by before their colours are compared: places and calibrations are not exact"""
 
 
 @dataclass(frozen=True)
@@ -38,16 +42,35 @@ def drawn(points: Points, count: int, rng: np.random.Generator, *, weight: np.nd
     return Points(points.xyz[rows], points.rgb[rows])
 
 
-def seen_colours(
-    cameras: Sequence[PinholeCamera], pictures: Sequence[np.ndarray], xyz: np.ndarray, near: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean colour [N, 3] of the pixels each point falls on, and the number of cameras that see it, int [N]."""
-    total, views = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.int64)
+@dataclass(frozen=True)
+class Sight:
+    """What cameras see where points are."""
+
+    rgb: np.ndarray
+    """float64 [P, 3]: mean of the pixels that a point falls on, 0 without any"""
+    deviation: np.ndarray
+    """float64 [P]: standard deviation between cameras, over channels; infinite where fewer than two see the point"""
+    views: np.ndarray
+    """int64 [P]: cameras that see it"""
+
+
+def look(cameras: Sequence[PinholeCamera], pictures: Sequence[np.ndarray], xyz: np.ndarray, near: float) -> Sight:
+    """How points, float64 [P, 3], look in pictures, float32 [3, H, W]. O(cameras * P)."""
+    total, squares, views = np.zeros((len(xyz), 3)), np.zeros(len(xyz)), np.zeros(len(xyz), np.int64)
     for camera, picture in zip(cameras, pictures, strict=True):
         inside, rows, columns = pixels_of(camera, xyz, near)
-        total[inside] += picture[:, rows, columns].T
+        colours = picture[:, rows, columns].T.astype(np.float64)
+        total[inside] += colours
+        squares[inside] += np.square(colours).sum(axis=1)
         views[inside] += 1
-    return total / np.maximum(views, 1)[:, None], views
+    mean = total / np.maximum(views, 1)[:, None]
+    spread = np.maximum(squares - views * np.square(mean).sum(axis=1), 0) / 3 / np.maximum(views - 1, 1)
+    return Sight(mean, np.where(views >= 2, np.sqrt(spread), np.inf), views)
+
+
+def softened(picture: np.ndarray) -> np.ndarray:
+    """The picture, float32 [3, H, W], blurred by `SOFT`."""
+    return np.stack([cv2.GaussianBlur(channel, (0, 0), SOFT) for channel in picture])
 
 
 def pixels_of(camera: PinholeCamera, xyz: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

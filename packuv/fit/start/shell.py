@@ -3,7 +3,8 @@
 Spheres of many radii about the scene's centre are painted with every camera's picture. Where a sphere passes through a
 surface, the cameras that see it agree on the pattern around a direction. Directions that several cameras agree on hold
 points as exact as calibrated ones and by the ten thousand, where feature matching finds a few hundred; the rest of the
-surface is drawn smoothly through them. A fit that starts there has walls where walls are, not haze before them.
+surface is drawn smoothly through them. A fit that starts there has walls where walls are, not haze before them. What
+stands in the room is not on the shell: there the cameras disagree on its colour, and nothing starts.
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ import numpy as np
 from numba import prange
 
 from packuv.camera import PinholeCamera
+from packuv.each import Each
 from packuv.fit.depth import SparseDepth
 from packuv.fit.start.bounds import Bounds
-from packuv.fit.start.points import Points, drawn, pixels_of, together
+from packuv.fit.start.first import AGREED
+from packuv.fit.start.points import Points, drawn, look, pixels_of, softened, together
 from packuv.kernels.compile import kernel, prefer_tbb
 from packuv.raster import ewa
 from packuv.raster.view import VIEW_CX, VIEW_CY, VIEW_FX, VIEW_FY, VIEW_HEIGHT, VIEW_NEAR, VIEW_WIDTH, view_constants
@@ -80,8 +83,11 @@ class Shell:
     """float64 [V, U, 3], in [0, 1]"""
     sure: np.ndarray
     """bool [V, U]: several cameras agree on the place; elsewhere it is interpolated"""
-    seen: np.ndarray
-    """bool [V, U]: before some camera, or next to a direction that is"""
+    likely: np.ndarray
+    """bool [V, U]: seen by some camera, or next to a direction that is, and cameras agree on its colour, or on that of
+    its surroundings where no two of them see it"""
+    explained: float
+    """Share of the directions seen by two cameras or more in which they agree on the colour, by solid angle"""
     seers: np.ndarray
     """bool [V, U, C]: cameras that agree on a sure place"""
 
@@ -92,36 +98,37 @@ class Shell:
         return SparseDepth(rows * camera.width + columns, camera.project(xyz[inside])[1].astype(np.float32))
 
     def places(self, count: int, rng: np.random.Generator) -> Points:
-        """About `count` places of the surface: some that cameras agree on, some evenly over the rest of what is seen,
+        """About `count` places of the surface: some that cameras agree on, some evenly over the rest of what is likely,
         which cover smooth walls, and most of the others where the surface has detail."""
         sure, even = self._sure_points(round(SURE_SHARE * count), rng), self._cover(round(EVEN_SHARE * count))
         return together(sure, even, self._detailed(count - len(sure.xyz) - len(even.xyz), rng))
 
     def _sure_points(self, count: int, rng: np.random.Generator) -> Points:
         """At most `count` of the places that cameras agree on, evenly over the sphere."""
-        weight = self._solid_angles()[self.sure]
+        weight = solid_angles(*self.sure.shape)[self.sure]
         return drawn(Points(self.xyz[self.sure], self.rgb[self.sure]), count, rng, weight=weight)
 
     def _cover(self, count: int) -> Points:
-        """Places evenly over what is seen and not sure; `count` would cover the whole sphere."""
+        """Places evenly over what is likely and not sure; `count` would cover the whole sphere."""
         rows, columns = self.sure.shape
         turn = np.arange(count) + 0.5
         polar, azimuth = np.arccos(1 - 2 * turn / max(count, 1)), np.pi * (1 + math.sqrt(5)) * turn  # Fibonacci
         v = np.minimum((polar / np.pi * rows).astype(np.int64), rows - 1)
         u = (azimuth / (2 * np.pi) * columns).astype(np.int64) % columns
-        open_places = self.seen & ~_grown(self.sure, 2)
+        open_places = self.likely & ~_grown(self.sure, 2)
         chosen = open_places[v, u]
         return Points(self.xyz[v, u][chosen], self.rgb[v, u][chosen])
 
     def _detailed(self, count: int, rng: np.random.Generator) -> Points:
-        """At most `count` places that are seen, the denser the more their surroundings differ in brightness."""
-        weight = (np.minimum(contrast(self.rgb.mean(axis=2)), STRONG) + FAINT) * self._solid_angles()
-        return drawn(Points(self.xyz[self.seen], self.rgb[self.seen]), count, rng, weight=weight[self.seen])
+        """At most `count` likely places, the denser the more their surroundings differ in brightness."""
+        weight = (np.minimum(contrast(self.rgb.mean(axis=2)), STRONG) + FAINT) * solid_angles(*self.sure.shape)
+        return drawn(Points(self.xyz[self.likely], self.rgb[self.likely]), count, rng, weight=weight[self.likely])
 
-    def _solid_angles(self) -> np.ndarray:
-        """Of the directions' cells, up to a factor, float64 [V, U]."""
-        polar = (np.arange(len(self.sure)) + 0.5) / len(self.sure) * np.pi
-        return np.broadcast_to(np.sin(polar)[:, None], self.sure.shape)
+
+def solid_angles(rows: int, columns: int) -> np.ndarray:
+    """Of the cells of a UV sphere, up to a factor, float64 [V, U]."""
+    polar = (np.arange(rows) + 0.5) / rows * np.pi
+    return np.broadcast_to(np.sin(polar)[:, None], (rows, columns))
 
 
 def contrast(brightness: np.ndarray) -> np.ndarray:
@@ -160,7 +167,21 @@ def sweep_shell(
     xyz = bounds.centre + distance[:, :, None] * rays
     rgb, views = _colours(xyz, cameras, pictures, bounds.near, np.where(sure[:, :, None], seers, True))
     filled = np.stack([interpolate(rgb[:, :, k], (views > 0).astype(np.float64)) for k in range(3)], axis=-1)
-    return Shell(xyz, filled, sure, _grown(views > 0, options.columns // 72), seers)
+    agreed, explained = _agreement_on_colour(xyz, cameras, pictures, bounds.near)
+    return Shell(xyz, filled, sure, _grown(views > 0, options.columns // 72) & agreed, explained, seers)
+
+
+def _agreement_on_colour(
+    xyz: np.ndarray, cameras: Sequence[PinholeCamera], pictures: Sequence[np.ndarray], near: float
+) -> tuple[np.ndarray, float]:
+    """Where the cameras agree on the colour of places [V, U, 3], bool [V, U], and the share of where two see them."""
+    soft = Each(lambda index: softened(pictures[index]), len(pictures))
+    rows, columns = xyz.shape[:2]
+    deviation = look(cameras, soft, xyz.reshape(-1, 3), near).deviation.reshape(rows, columns)
+    agreed, weight = deviation < AGREED, solid_angles(rows, columns) * np.isfinite(deviation)
+    around = interpolate(agreed.astype(np.float64), weight) > 0.5
+    explained = float((weight * agreed).sum() / max(weight.sum(), 1e-12))
+    return np.where(np.isfinite(deviation), agreed, around), explained
 
 
 def _grown(mask: np.ndarray, cells: int) -> np.ndarray:

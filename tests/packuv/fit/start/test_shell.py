@@ -3,6 +3,8 @@ import pytest
 
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
+from packuv.fit.start.first import AGREED
+from packuv.fit.start.points import look, softened
 from packuv.fit.start.shell import MOST_PIXELS, Shell, ShellOptions, coarse, directions, interpolate, sweep_shell
 
 RADII = np.array([5.0, 5.6, 4.7])
@@ -55,10 +57,27 @@ def test_places_are_denser_where_the_wall_has_detail():
     rays = directions(64)
     striped, seen = rays[:, :, 0] > 0, np.ones(rays.shape[:2], bool)
     grey = np.where(striped & (np.arange(64) % 4 < 2), 0.9, 0.4)
-    shell = Shell(rays, np.repeat(grey[:, :, None], 3, axis=2), ~seen, seen, np.zeros((*seen.shape, 1), bool))
+    shell = Shell(rays, np.repeat(grey[:, :, None], 3, axis=2), ~seen, seen, 1.0, np.zeros((*seen.shape, 1), bool))
     xyz = shell.places(800, np.random.default_rng(0)).xyz
     # 55 % are spread evenly, so half of the sphere has 28 % of them by these alone.
     assert 0.25 * 800 < (xyz[:, 0] < 0).sum() < 0.35 * 800
+
+
+def test_places_stay_away_from_what_stands_before_the_wall(room):
+    cameras, pictures = room
+    hidden = [picture.copy() for picture in pictures]
+    for index, picture in enumerate(hidden):  # before the foot of the wall something that looks different to each
+        picture[:, 2 * picture.shape[1] // 3 :] = np.float32([0.1, 0.5, 0.9][index % 3])
+    clear = sweep_shell(cameras, pictures, bounds=BOUNDS, options=OPTIONS)
+    spoilt = sweep_shell(cameras, hidden, bounds=BOUNDS, options=OPTIONS)
+    assert clear is not None
+    assert spoilt is not None
+    assert clear.explained > 0.8
+    assert spoilt.explained < clear.explained - 0.2
+    assert spoilt.likely.mean() < clear.likely.mean()
+    sight = look(cameras, [softened(picture) for picture in hidden],
+                 spoilt.places(1000, np.random.default_rng(0)).xyz, BOUNDS.near)  # fmt: skip
+    assert (sight.deviation[sight.views > 1] < AGREED).mean() > 0.85
 
 
 def test_pictures_finer_than_the_sphere_are_halved_first(room):
