@@ -142,17 +142,28 @@ def verified_matches(
     def verified(pair: tuple[str, str]) -> PairMatches | None:
         first, second = pair
         rows, _ = match(features[first], features[second], ratio=ratio)
-        if len(rows) < 8:
-            return None
         a, b = features[first].pixels[rows[:, 0]], features[second].pixels[rows[:, 1]]
         flat = [_undistorted(rig[name], pixels) for name, pixels in ((first, a), (second, b))]
-        _, mask = cv2.findFundamentalMat(flat[0], flat[1], cv2.USAC_MAGSAC, 2.0, 0.999, 10_000)
-        if mask is None:
-            return None
-        kept = mask.ravel().astype(bool)
-        return PairMatches(first, second, a[kept], b[kept])
+        kept = on_one_geometry(*flat)
+        return None if kept is None else PairMatches(first, second, a[kept], b[kept])
 
     return [found for found in side_by_side(verified, pairs) if found]
+
+
+def on_one_geometry(first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
+    """Which matches, undistorted pixels float64 [N, 2] each, agree on some epipolar geometry, bool [N], or None.
+
+    A feature with several orientations matches several times from one place: eight places are needed in each picture.
+    """
+    if min(len(np.unique(pixels, axis=0)) for pixels in (first, second)) < 8:
+        return None
+    try:
+        _, mask = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, 2.0, 0.999, 10_000)
+    except cv2.error as error:
+        if error.func != "setModelParameters":  # what fails when refining leaves no model, as of a plane and outliers
+            raise
+        return None
+    return None if mask is None else mask.ravel().astype(bool)
 
 
 def detect_all(rig: Rig, pictures: Mapping[str, np.ndarray], *, options: FeatureOptions) -> dict[str, Features]:
