@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.each import Each
 from packuv.fit.start.bounds import Bounds
-from packuv.fit.start.points import Points, drawn, look, no_points, softened, together
+from packuv.fit.start.points import Points, look, no_points, together
 from packuv.gaussians.codes import OPACITY_RANGE
 from packuv.gaussians.floats import Gaussians, logit
 
@@ -22,15 +21,6 @@ AIR_OPACITY = 0.1
 
 _ROUNDS = 8
 """Draws of random places before fewer than asked for will do"""
-
-_CHOICE = 8
-"""Random places for each that a Gaussian starts from, the rather the better cameras agree on its colour"""
-
-AGREED = 0.05
-"""Deviation between cameras, of colours 0 to 1, beyond which a place is hardly on a surface"""
-
-_LEAST_WEIGHT = 1e-3
-"""Of places that cameras do not agree on, beside 1: what is hidden from one of them is a surface all the same"""
 
 _ROOM = 0.8
 """Share of the cap that a fit may start with; the rest is for where detail turns out to be"""
@@ -47,7 +37,7 @@ class StartOptions:
     """Random Gaussians fill a ball of this many radii about the centre"""
     min_views: int = 3
     """Cameras that must see a random Gaussian; all of them in smaller rigs"""
-    surface_share: float = 0.9
+    surface_share: float = 0.8
     """Gaussians that start on surfaces, triangulated points and the shell, beside the share of the shell that cameras
     agree on; what is left fills the volume"""
     surface_opacity: float = 0.3
@@ -68,8 +58,8 @@ def first_gaussians(
     sh_degree: int,
     seed: int,
 ) -> Gaussians:
-    """Gaussians on the points of the surface and in the volume that several cameras see, the rather where they agree,
-    `options.count` together, coloured by the pictures.
+    """Gaussians on the points of the surface and at random in the volume that several cameras see, `options.count`
+    together, coloured by the pictures.
 
     Raises ValueError if no place is seen by enough cameras.
     """
@@ -115,22 +105,20 @@ def _random_points(
     rng: np.random.Generator,
 ) -> Points:
     needed = min(options.min_views, len(cameras))
-    soft = Each(lambda index: softened(pictures[index]), len(pictures))
-    found, weight = no_points(), np.empty(0)
+    found = no_points()
     for _ in range(_ROUNDS if count else 0):
-        xyz = random_ball(rng, 4 * _CHOICE * count) * options.volume * bounds.radius + bounds.centre
-        sight = look(cameras, soft, xyz, bounds.near)
+        xyz = random_ball(rng, 4 * count) * options.volume * bounds.radius + bounds.centre
+        sight = look(cameras, pictures, xyz, bounds.near)
         seen = sight.views >= needed
         found = together(found, Points(xyz[seen], sight.rgb[seen]))
-        weight = np.append(weight, np.exp(-0.5 * np.square(sight.deviation[seen] / AGREED)) + _LEAST_WEIGHT)
-        if len(weight) >= _CHOICE * count:
+        if len(found.xyz) >= count:
             break
-    if count and not len(weight):
+    if count and not len(found.xyz):
         raise ValueError(
             f"no place within {options.volume} rig radii is seen by {needed} cameras; check the calibration: "
             "do the cameras look at a common volume?"
         )
-    return drawn(found, count, rng, weight=weight)
+    return Points(found.xyz[:count], found.rgb[:count])
 
 
 def random_ball(rng: np.random.Generator, count: int) -> np.ndarray:

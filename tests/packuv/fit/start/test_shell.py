@@ -3,9 +3,17 @@ import pytest
 
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import Bounds
-from packuv.fit.start.first import AGREED
 from packuv.fit.start.points import look, softened
-from packuv.fit.start.shell import MOST_PIXELS, Shell, ShellOptions, coarse, directions, interpolate, sweep_shell
+from packuv.fit.start.shell import (
+    AGREED,
+    MOST_PIXELS,
+    Shell,
+    ShellOptions,
+    coarse,
+    directions,
+    interpolate,
+    sweep_shell,
+)
 
 RADII = np.array([5.0, 5.6, 4.7])
 """Half axes of the room in these tests: an ellipsoid about the origin"""
