@@ -54,15 +54,26 @@ class Sight:
     """int64 [P]: cameras that see it"""
 
 
-def look(cameras: Sequence[PinholeCamera], pictures: Sequence[np.ndarray], xyz: np.ndarray, near: float) -> Sight:
-    """How points, float64 [P, 3], look in pictures, float32 [3, H, W]. O(cameras * P)."""
+def look(
+    cameras: Sequence[PinholeCamera],
+    pictures: Sequence[np.ndarray],
+    xyz: np.ndarray,
+    near: float,
+    *,
+    may: np.ndarray | None = None,
+) -> Sight:
+    """How points, float64 [P, 3], look in pictures, float32 [3, H, W], to the cameras that may see each, bool [P, C].
+
+    O(cameras * P).
+    """
     total, squares, views = np.zeros((len(xyz), 3)), np.zeros(len(xyz)), np.zeros(len(xyz), np.int64)
-    for camera, picture in zip(cameras, pictures, strict=True):
+    for index, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
         inside, rows, columns = pixels_of(camera, xyz, near)
-        colours = picture[:, rows, columns].T.astype(np.float64)
-        total[inside] += colours
-        squares[inside] += np.square(colours).sum(axis=1)
-        views[inside] += 1
+        use = slice(None) if may is None else may[inside, index]
+        seen, colours = np.flatnonzero(inside)[use], picture[:, rows[use], columns[use]].T.astype(np.float64)
+        total[seen] += colours
+        squares[seen] += np.square(colours).sum(axis=1)
+        views[seen] += 1
     mean = total / np.maximum(views, 1)[:, None]
     spread = np.maximum(squares - views * np.square(mean).sum(axis=1), 0) / 3 / np.maximum(views - 1, 1)
     return Sight(mean, np.where(views >= 2, np.sqrt(spread), np.inf), views)

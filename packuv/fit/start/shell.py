@@ -166,7 +166,9 @@ def sweep_shell(
     distance = bounds.radius / interpolate(inverse, smooth.astype(np.float64))
     distance[sure] = bounds.radius / inverse[sure]
     xyz = bounds.centre + distance[:, :, None] * rays
-    rgb, views = _colours(xyz, cameras, pictures, bounds.near, np.where(sure[:, :, None], seers, True))
+    may = np.where(sure[:, :, None], seers, True).reshape(-1, len(cameras))
+    sight = look(cameras, pictures, xyz.reshape(-1, 3), bounds.near, may=may)
+    rgb, views = sight.rgb.reshape(xyz.shape), sight.views.reshape(sure.shape)
     filled = np.stack([interpolate(rgb[:, :, k], (views > 0).astype(np.float64)) for k in range(3)], axis=-1)
     agreed, explained = _agreement_on_colour(xyz, cameras, pictures, bounds.near)
     return Shell(xyz, filled, sure, _grown(views > 0, options.columns // 72) & agreed, explained, seers)
@@ -277,25 +279,6 @@ def coarse(camera: PinholeCamera, columns: int) -> PinholeCamera:
     while camera.fx * 2 * math.pi / columns >= MOST_PIXELS:
         camera = camera.scaled(camera.width // 2, camera.height // 2)
     return camera
-
-
-def _colours(
-    xyz: np.ndarray,
-    cameras: Sequence[PinholeCamera],
-    pictures: Sequence[np.ndarray],
-    near: float,
-    seers: np.ndarray,  # bool [V, U, C]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean colour [V, U, 3] over the cameras that see a place, and the number of them [V, U]."""
-    points, may = xyz.reshape(-1, 3), seers.reshape(-1, len(cameras))
-    total, views = np.zeros_like(points), np.zeros(len(points), np.int64)
-    for index, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
-        inside, rows, columns = pixels_of(camera, points, near)
-        use = may[inside, index]
-        place = np.flatnonzero(inside)[use]
-        total[place] += picture[:, rows[use], columns[use]].T
-        views[place] += 1
-    return (total / np.maximum(views, 1)[:, None]).reshape(xyz.shape), views.reshape(xyz.shape[:2])
 
 
 _in_camera = kernel(inline=True)(ewa.in_camera)

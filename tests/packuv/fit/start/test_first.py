@@ -3,13 +3,7 @@ import pytest
 
 from packuv.camera import PinholeCamera
 from packuv.fit.start.bounds import find_bounds
-from packuv.fit.start.first import (
-    StartOptions,
-    first_gaussians,
-    neighbour_distance,
-    random_ball,
-    round_gaussians,
-)
+from packuv.fit.start.first import StartOptions, first_gaussians, neighbour_distance, random_ball, round_gaussians
 from packuv.fit.start.hull import hull_points
 from packuv.fit.start.points import Points, look, pixels_of
 
