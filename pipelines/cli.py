@@ -201,6 +201,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _manifest(
         command("manifest", "pipelines.commands.datasets:manifest", "list the captures of a data set in a Parquet file")
     )
+    _plan(command("plan", "pipelines.commands.plan:command", "tell what a run or a batch would do, and what it takes"))
     _batch(command("batch", "pipelines.commands.batch:command", "process every sequence of a manifest"))
     _scene(command("info", "pipelines.commands.scenes:info", "show what a scene file holds"), json=True)
     _verify(
@@ -248,6 +249,22 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
     )
     command.add_argument("--jobs", type=_positive, default=None, metavar="N", help="segments at once (from the cores)")
     _how(command, stop=stop)
+    _direct(command)
+
+
+def _plan(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "source", type=Path, metavar="CAPTURE|MANIFEST", help="capture folder, manifest, or folder of captures"
+    )
+    command.add_argument(
+        "--out", type=Path, default=Path("runs"), metavar="DIR", help="where the results would go, or are (runs)"
+    )
+    command.add_argument(
+        "--hold-out", type=_names, default=None, metavar="CAM,CAM", help="cameras to score on (capture.toml)"
+    )
+    _which(command)
+    command.add_argument("--jobs", type=_positive, default=None, metavar="N", help="segments at once (from the cores)")
+    _how(command, stop=True)
 
 
 def _batch(command: argparse.ArgumentParser) -> None:
@@ -255,6 +272,18 @@ def _batch(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/ and DIR/index.html"
     )
+    _which(command)
+    command.add_argument("--jobs", type=_positive, default=1, metavar="N", help="segments of a sequence at once")
+    command.add_argument("--dry-run", action="store_true", help="only tell what would run, and why")
+    command.add_argument(
+        "--notify", default=None, metavar="CMD", help="shell command to run at the end if something failed"
+    )
+    _how(command, stop=True)
+    _direct(command)
+
+
+def _which(command: argparse.ArgumentParser) -> None:
+    """Sequences of a manifest."""
     command.add_argument(
         "--names", type=_names, default=(), metavar="GLOB,GLOB", help="only sequences with one of these names (all)"
     )
@@ -264,12 +293,10 @@ def _batch(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--at-once", type=_positive, default=None, metavar="N", help="sequences at a time (from cores and memory)"
     )
-    command.add_argument("--jobs", type=_positive, default=1, metavar="N", help="segments of a sequence at once")
-    command.add_argument("--dry-run", action="store_true", help="only tell what would run, and why")
-    command.add_argument(
-        "--notify", default=None, metavar="CMD", help="shell command to run at the end if something failed"
-    )
-    _how(command, stop=True)
+
+
+def _direct(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--direct", action="store_true", help="run the same stages without the workflow engine")
 
 
 def _how(command: argparse.ArgumentParser, *, stop: bool) -> None:
@@ -300,7 +327,6 @@ def _how(command: argparse.ArgumentParser, *, stop: bool) -> None:
     )
     if stop:
         command.add_argument("--stop-after", choices=STAGES, default="report", metavar="STAGE", help=", ".join(STAGES))
-    command.add_argument("--direct", action="store_true", help="run the same stages without the workflow engine")
     command.add_argument("--config", type=Path, default=None, metavar="FILE", help="TOML file with settings by stage")
     _seed(command)
     _set(command, "a setting of a stage; wins over --config and --preset")

@@ -101,6 +101,11 @@ def sentence(error: ValueError | OSError) -> str:
     return " ".join(text.split())
 
 
+def holds_capture(folder: Path) -> bool:
+    """Whether a folder is taken for one capture, be it a whole one or not."""
+    return (folder / "videos").is_dir() or (folder / SETTINGS).is_file()
+
+
 def _capture_folders(dataset: Path, unreadable: list[Path]) -> Iterator[Path]:
     """Real folders first, so that a link to one of them adds nothing."""
     real, links, seen = [dataset], list[Path](), set[tuple[int, int]]()
@@ -115,7 +120,7 @@ def _capture_folders(dataset: Path, unreadable: list[Path]) -> Iterator[Path]:
         if (stat.st_dev, stat.st_ino) in seen:
             continue
         seen.add((stat.st_dev, stat.st_ino))
-        if folder / "videos" in inside or (folder / SETTINGS).is_file():
+        if holds_capture(folder):
             yield folder
         elif not _is_output(folder):
             for path in reversed(inside):

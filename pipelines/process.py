@@ -11,19 +11,21 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from packuv.fit.device import choose_device
 from packuv.partial import partial_path
 from pipelines.chain import Submit
-from pipelines.choice import PILOT_FRAMES, Affordable, Priced, affordable, chosen_of
+from pipelines.choice import PILOT_FRAMES, Affordable, Priced, affordable, check_judges, chosen_of
 from pipelines.events import Event, Journal
 from pipelines.folder import claim
-from pipelines.forecast import Machine, size_of
+from pipelines.forecast import Forecast, Guess, Machine, forecast, machine_of, question_of, size_of
 from pipelines.ladder import up_to
 from pipelines.lender import lender_of
 from pipelines.options import SequenceOptions, compose
+from pipelines.probe import remembered
 from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
 from pipelines.results import Ending, Run, collect, ending_of, run_json
@@ -45,10 +47,13 @@ from tasks.stages.evaluate import METRICS
 from tasks.stages.plan import Plan
 
 PARTIAL = "scene.partial.mkv"
+FORECAST = "forecast"
 IDLE_SECONDS = 5.0
 """For stages that are cut to say so"""
 MOST_FINDINGS = 8
 """That the terminal shows"""
+WORTH_MINUTES = 2.0
+"""A run that seems to take less is not worth the seconds of a look at machine and capture"""
 CORES_PER_JOB = 4
 """A fit's threads wait for each other often enough that a big machine is better used by several fits side by side"""
 
@@ -141,7 +146,9 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     Raises ValueError or FileNotFoundError for bad input, OSError when the disk cannot hold the results, CancelledError
     when the jobs are cancelled, and what a failing stage raises. Whatever ends the run, no job goes on after it.
     """
-    affordable = affordable_points(request)
+    capture = find_sequence(request)
+    claim(Path(request.out) / capture.name, capture)
+    affordable = affordable_points(request, jobs)
     sequence, run = prepare(request, journal, engine, jobs, affordable)
     folder, workshop = run.workshop.store.root.parent, run.workshop
     bury(folder, engine.crashed)
@@ -151,6 +158,7 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     with workshop.store.in_use(), on_record as register, journal.heard_by(register):
         try:
             sequence, run = settle(sequence, run, engine, affordable)
+            run = replace(run, forecast=foreseen(run, journal))
             sequence.run(request.stop_after)
             outcome = _publish(run, folder)
         except BaseException as error:
@@ -165,12 +173,28 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
         return outcome
 
 
+def foreseen(run: Run, journal: Journal) -> Forecast | None:
+    """What the run will take, had nothing been there; None where that is not worth a look."""
+    capture, jobs, folder = run.workshop.capture, run.workshop.jobs, run.workshop.store.root.parent
+    size, at_once = size_of(capture, run.plan), jobs_at_once(run.request)
+    question = question_of(run.plan, size, (run.options,))
+    rough = forecast(size, run.options, Machine(Guess(), at_once), run.request.stop_after)
+    if rough.minutes < WORTH_MINUTES and remembered(folder, question, jobs) is None:
+        return None
+    journal.started(FORECAST)
+    machine = machine_of(folder, question, jobs, at_once, progress=partial(journal.moved, FORECAST))
+    found = forecast(size, run.options, machine, run.request.stop_after)
+    journal.ended(FORECAST)
+    journal.told(FORECAST, found.told)
+    return found
+
+
 def is_made(request: RunRequest) -> bool:
     """Whether every artefact of the run is there, so that nobody is needed to make one."""
     jobs = jobs_of(request)
     jobs.cancel("only looking")
     try:
-        engine, affordable = Engine(lambda make: lambda stage: There(make(stage))), affordable_points(request)
+        engine, affordable = Engine(lambda make: lambda stage: There(make(stage))), affordable_points(request, jobs)
         settle(*prepare(request, Journal(), engine, jobs, affordable), engine, affordable)[0].run(request.stop_after)
     except Exception:  # whatever it is, the run itself meets it again
         return False
@@ -187,7 +211,7 @@ class There:
         return self.key
 
 
-def affordable_points(request: RunRequest) -> Affordable:
+def affordable_points(request: RunRequest, jobs: Jobs) -> Affordable:
     """Points that may be chosen, from fast to fine; none where no time and no error is asked for.
 
     Raises ValueError where not even the fastest fits into the time, or an error is asked for and no camera held out.
@@ -196,12 +220,11 @@ def affordable_points(request: RunRequest) -> Affordable:
         return ()
     capture = find_sequence(request)
     plan = plan_of(request, capture)
-    return affordable(
-        request,
-        {point: options_of(request, capture, point) for point in up_to(request.preset)},
-        size_of(capture, plan),
-        Machine(cores_of(request), jobs_at_once(request)),
-    )
+    check_judges(request, plan.held_out)
+    folder, size = Path(request.out) / capture.name, size_of(capture, plan)
+    points = {point: options_of(request, capture, point) for point in up_to(request.preset)}
+    machine = machine_of(folder, question_of(plan, size, tuple(points.values())), jobs, jobs_at_once(request))
+    return affordable(request, points, size, machine)
 
 
 def options_of(request: RunRequest, capture: Capture, point: str) -> SequenceOptions:

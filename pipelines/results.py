@@ -21,6 +21,7 @@ from packuv.footage import Light
 from packuv.scene import open_scene
 from packuv.score import read_table
 from pipelines.events import Event, Journal
+from pipelines.forecast import Forecast
 from pipelines.options import SequenceOptions
 from pipelines.request import RunRequest
 from pipelines.stages import Made
@@ -31,6 +32,7 @@ from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
 from tasks.report.facts import (
     Choice,
+    Compared,
     Comparison,
     FrameScore,
     LastingChange,
@@ -71,6 +73,7 @@ class Run:
     started: datetime
     made: Made
     choice: Choice | None = None
+    forecast: Forecast | None = None
 
     def folder(self, stage: str) -> Path | None:
         """Folder of the first artefact of a stage, or None if the run did not come to it."""
@@ -110,6 +113,7 @@ def run_json(run: Run, ending: Ending) -> dict[str, Any]:
         "request": plain(run.request),
         "options": plain(run.options),
         "choice": plain(run.choice),
+        "forecast": plain(run.forecast),
         "cameras": {"fitted": run.plan.fitted, "held_out": run.plan.held_out},
         "stages": [event.to_json() for event in events],
         "skipped": [{"what": event.label, "why": event.reason} for event in events if event.outcome == "skipped"],
@@ -163,8 +167,44 @@ def collect(run: Run) -> ReportInput:
         scene=_scene(run),
         pictures=tuple(_pictures(run.folder("evaluate"))),
         stages=tuple(_stage(run.workshop.store, event) for event in run.journal.events),
+        forecast=tuple(_compared(run)),
         choice=run.choice and replace(run.choice, minutes=seconds / 60, psnr_db=_level(scores)),
     )
+
+
+GROUPS = {
+    "sync": "sync",
+    **dict.fromkeys(("rig", "light", "points"), "calibrate"),
+    **dict.fromkeys(("motion", "patches", "keyframes"), "flow"),
+    **dict.fromkeys(("background", "backdrop", "key", "segment", "preview"), "fit"),
+    **{name: name for name in ("encode", "verify", "evaluate")},
+}
+"""Stage that each kind of artefact belongs to"""
+
+
+def _compared(run: Run) -> Iterator[Compared]:
+    """What was forecast beside what came. Times are those of what the run is made of, whoever made it, in the order of
+    a machine that does one thing at a time."""
+    if run.forecast is None:
+        return
+    receipts = [
+        (key.stage, run.workshop.store.receipt(key))
+        for keys in run.made.keys.values()
+        for key in keys
+        if run.workshop.store.holds(key)  # what another take lends lies in a store of its own
+    ]
+    for stage, seconds in run.forecast.seconds.items():
+        took = [receipt.seconds for name, receipt in receipts if GROUPS[name] == stage]
+        yield Compared(stage, "min", seconds / 60, sum(took) / 60 if took else None)
+    whole = sum(receipt.seconds for _, receipt in receipts)
+    yield Compared("in all", "min", run.forecast.minutes, whole / 60)
+    peak = max((receipt.peak_memory_bytes for _, receipt in receipts), default=0)
+    yield Compared("memory of the largest job", "GB", run.forecast.memory_bytes / 1e9, peak / 1e9)
+    kept = sum(receipt.size_bytes for _, receipt in receipts)
+    yield Compared("on disk", "GB", run.forecast.disk_bytes / 1e9, kept / 1e9)
+    folder = run.folder("encode")
+    scene = (folder / SCENE).stat().st_size / 1e6 if folder else None
+    yield Compared("scene file", "MB", run.forecast.scene_bytes / 1e6, scene)
 
 
 def _level(scores: Sequence[FrameScore]) -> float | None:

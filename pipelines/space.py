@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import errno
+from pathlib import Path
 
-from packuv.motion.step import fitted_size
 from pipelines.disk import free_bytes, size_text, used_bytes
+from pipelines.forecast import Size, store_bytes
 from pipelines.options import SequenceOptions
 from sync.align import FrameGroups
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.footage import PictureOptions
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import read_videos, selected
 
 MARGIN = 1.5
 """The forecast is rough, and others write to the disk, too"""
-CODE_BYTES = 14
-"""Of one Gaussian without view dependence: three 16-bit positions, eight of ten 8-bit columns after removing repeats"""
-COPIES = 3
-"""A fit's codes lie in its checkpoints, its segment and, less than that, in the scene file"""
 
 
 def check_space(workshop: Workshop, plan: Plan, options: SequenceOptions, groups: Key) -> None:
@@ -28,33 +24,31 @@ def check_space(workshop: Workshop, plan: Plan, options: SequenceOptions, groups
     What lies in the store counts as written by this run, so that a run that stopped may go on where it fits.
     """
     root = workshop.store.root
-    needed, free = MARGIN * forecast_bytes(workshop, plan, options, groups) - used_bytes(root), free_bytes(root)
-    if free < needed:
+    check_room(root, store_bytes(size_found(workshop, plan, groups), options))
+
+
+def check_room(root: Path, needed: float) -> None:
+    """Raise OSError unless the disk has room for so many bytes in this store, and some more."""
+    check_free(root, missing_bytes(root, needed))
+
+
+def check_free(root: Path, needed: float) -> None:
+    """Raise OSError unless so many bytes are free on the disk where this folder is, or would be."""
+    if (free := free_bytes(root)) < needed:
         raise OSError(
             errno.ENOSPC,
-            f"this run needs about {size_text(needed)} more under {root}, but {size_text(free)} are free; "
+            f"this needs about {size_text(needed)} more under {root}, but {size_text(free)} are free; "
             "free some, or choose another --out, fewer --frames, or motion.keep_flow=false",
         )
 
 
-def forecast_bytes(workshop: Workshop, plan: Plan, options: SequenceOptions, groups: Key) -> int:
-    """Bytes that the flow cache and the fit of a synchronized capture take, roughly."""
+def missing_bytes(root: Path, needed: float) -> float:
+    """How much room to ask for where a store is to hold so much."""
+    return max(0.0, MARGIN * needed - (used_bytes(root) if root.is_dir() else 0))
+
+
+def size_found(workshop: Workshop, plan: Plan, groups: Key) -> Size:
+    """Of a synchronized capture, whose instants are known."""
     instants = len(selected(FrameGroups.load(workshop.path(groups)), plan.first, plan.stop))
     videos = read_videos(workshop.path(groups))
-    pictures = sum(_motion_bytes(videos[name]["width"], videos[name]["height"], options) for name in plan.fitted)
-    columns = CODE_BYTES + 3 * ((options.fit.sh_degree + 1) ** 2 - 1)
-    return instants * (pictures + COPIES * columns * options.fit.density.cap)
-
-
-def _motion_bytes(width: int, height: int, options: SequenceOptions) -> int:
-    """Of one picture: flow as two float16 per pixel, the mask as bits."""
-    width, height = _fitted(width, height, options.pictures)
-    flow = fitted_size(width, height, min(options.motion.flow_width, options.motion.width))
-    mask = fitted_size(width, height, options.motion.width)
-    return (4 * flow[0] * flow[1] if options.motion.keep_flow else 0) + mask[0] * mask[1] // 8
-
-
-def _fitted(width: int, height: int, options: PictureOptions) -> tuple[int, int]:
-    if options.max_width is None or width <= options.max_width:
-        return width, height
-    return options.max_width, round(height * options.max_width / width)
+    return Size(instants, tuple((videos[name]["width"], videos[name]["height"]) for name in plan.fitted))

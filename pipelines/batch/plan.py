@@ -78,6 +78,11 @@ class Step:
     def runs(self) -> bool:
         return bool(self.why) and self.problem is None
 
+    @property
+    def does(self) -> str:
+        """For people."""
+        return "bad input" if self.problem is not None else "runs" if self.runs else "there already"
+
 
 @dataclass(frozen=True)
 class Plan:

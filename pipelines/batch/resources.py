@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.process import CORES_PER_JOB
+from pipelines.process import CORES_PER_JOB, cores_of
 
 BYTES_PER_SEQUENCE = 3_000_000_000
 """A fit with 80,000 Gaussians and its pictures takes 2.3 GB"""
@@ -19,6 +19,11 @@ def sequences_at_once(cores: int, memory_bytes: int | None) -> int:
     """
     by_memory = cores if memory_bytes is None else memory_bytes // BYTES_PER_SEQUENCE
     return max(1, min(cores // CORES_PER_JOB, by_memory))
+
+
+def default_at_once() -> int:
+    """Sequences at a time on this machine as it is now."""
+    return sequences_at_once(cores_of(), available_memory_bytes())
 
 
 def available_memory_bytes(*, proc: Path = PROC, cgroup: Path = CGROUP) -> int | None:

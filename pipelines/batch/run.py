@@ -19,7 +19,7 @@ from pipelines.batch.notify import notify
 from pipelines.batch.pace import Headway, Pace
 from pipelines.batch.plan import Fingerprint, Plan, Step, look_again, plan_batch, with_result
 from pipelines.batch.request import BatchRequest
-from pipelines.batch.resources import available_memory_bytes, sequences_at_once
+from pipelines.batch.resources import default_at_once
 from pipelines.batch.summary import Summary, of_result
 from pipelines.batch.table import Result, ResultTable, Status
 from pipelines.events import Event, Forecast, Journal
@@ -82,7 +82,7 @@ class Batch:
         self._table = ResultTable(request.table)
         self._table.check()
         steps = self._plan.to_run
-        wide = request.at_once or _default_at_once()
+        wide = request.at_once or default_at_once()
         self.at_once = min(wide, max(1, len(steps)))
         """Sequences at a time"""
         # With a time limit the cores decide what is fitted, so they must not depend on how many sequences are left.
@@ -308,10 +308,6 @@ class _Ear:
         self._tell()
 
     def told(self, label: str, text: str) -> None: ...
-
-
-def _default_at_once() -> int:
-    return sequences_at_once(cores_of(), available_memory_bytes())
 
 
 def _earlier(plan: Plan) -> Iterator[tuple[float, int]]:

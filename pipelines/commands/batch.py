@@ -83,7 +83,7 @@ def _tell(request: BatchRequest, *, as_json: bool) -> int:
 
     steps = plan_batch(with_manifest(request)).steps
     if as_json:
-        answer(json.dumps([{"sequence": step.name, "does": _does(step), "why": step.why} for step in steps], indent=1))
+        answer(json.dumps([{"sequence": step.name, "does": step.does, "why": step.why} for step in steps], indent=1))
         return 0
     print_table(_table(steps))
     print(f"{sum(step.runs for step in steps)} of {len(steps)} sequences would run")
@@ -94,12 +94,6 @@ def _table(steps: Sequence[Step]) -> Table:
     table = Table("sequence", "frames", "does", "why")
     for step in steps:
         style = "yellow" if step.problem else "" if step.runs else "dim"
-        cells = (step.name, str(step.frames), _does(step), step.why)
+        cells = (step.name, str(step.frames), step.does, step.why)
         table.add_row(*(Text(cell) for cell in cells), style=style)
     return table
-
-
-def _does(step: Step) -> str:
-    if step.problem is not None:
-        return "bad input"
-    return "runs" if step.runs else "there already"

@@ -239,6 +239,17 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Compared:
+    """What was forecast before a run, and what came."""
+
+    what: str
+    unit: str
+    forecast: float
+    fact: float | None
+    """None where the run did not come to it"""
+
+
+@dataclass(frozen=True)
 class ReportInput:
     """All that a report may show; leave out what there is not."""
 
@@ -275,6 +286,8 @@ class ReportInput:
     pictures: tuple[Comparison, ...] = ()
     stages: tuple[StageRecord, ...] = ()
     choice: Choice | None = None
+    forecast: tuple[Compared, ...] = ()
+    """Empty where nothing was forecast"""
     """Where the user named a time or an error instead of a preset"""
 
 

@@ -29,6 +29,7 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
             "finished": report.finished,
             "seconds": report.seconds,
             "choice": report.choice and plain(report.choice),
+            "forecast": [plain(row) for row in report.forecast],
         },
         "summary": summary(report),
         "findings": [plain(finding) for finding in findings(report, limits)],

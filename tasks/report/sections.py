@@ -343,7 +343,8 @@ def _stages(report: ReportInput) -> Body:
     if not ran:
         return "No stage was recorded."
     longest = max(stage.seconds for stage in ran) or 1
-    return {"seconds": sum(stage.seconds for stage in ran), "stages": [_stage_row(stage, longest) for stage in ran]}
+    rows = [_stage_row(stage, longest) for stage in ran]
+    return {"seconds": sum(stage.seconds for stage in ran), "stages": rows, "forecast": report.forecast}
 
 
 def _stage_row(stage: StageRecord, longest: float) -> View:

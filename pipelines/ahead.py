@@ -1,0 +1,191 @@
+"""What a run would do: what of it is there, what would run, what is spared and why, and what all of it takes.
+
+Looks at captures and stores, and changes neither; only the seconds' look at the machine is new each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from packuv.lpips import lacking
+from packuv.progress import Progress, no_progress
+from pipelines.disk import free_bytes
+from pipelines.events import Event, Journal
+from pipelines.forecast import Forecast, Machine, Size, forecast, machine_of, question_of, size_of
+from pipelines.options import SequenceOptions
+from pipelines.process import (
+    Engine,
+    There,
+    affordable_points,
+    find_sequence,
+    jobs_at_once,
+    jobs_of,
+    options_of,
+    plan_of,
+    prepare,
+    settle,
+)
+from pipelines.request import STAGES, RunRequest
+from pipelines.space import check_room, missing_bytes
+from pipelines.stages import Made
+from sync.capture import Capture
+from tasks.artefacts.jobs import CancelledError
+from tasks.artefacts.store import Store
+from tasks.stages.plan import Plan
+
+LAST_OF = {
+    "sync": "sync",
+    "calibrate": "points",
+    "flow": "keyframes",
+    "encode": "encode",
+    "verify": "verify",
+    "evaluate": "evaluate",
+}
+"""Kind of the artefact that a stage ends with; the fit ends where the scene is encoded"""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One stage of `pipelines.request.STAGES`."""
+
+    stage: str
+    does: str
+    """runs, goes on, or there already"""
+    minutes: float
+    """That are left"""
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """What a run would do."""
+
+    name: str
+    """Of the sequence"""
+    preset: str
+    size: Size
+    steps: tuple[Step, ...]
+    spared: tuple[tuple[str, str], ...]
+    """What is not done, and why, as far as it is known before"""
+    unknown: tuple[str, ...]
+    """What the forecast leaves out"""
+    forecast: Forecast
+    """Had nothing been there"""
+    moving: float | None
+    """Share of the pictures' tiles that something moves in"""
+    root: Path
+    """Of the store"""
+
+    @property
+    def minutes(self) -> float:
+        """That are left."""
+        return sum(step.minutes for step in self.steps)
+
+    def check_room(self) -> None:
+        """Raise OSError (no space) where the disk cannot hold what is left to write."""
+        check_room(self.root, self.forecast.disk_bytes)
+
+    @property
+    def missing_bytes(self) -> float:
+        """On the disk, for what is left to write, with a margin."""
+        return missing_bytes(self.root, self.forecast.disk_bytes)
+
+    @property
+    def free_bytes(self) -> int:
+        return free_bytes(self.root)
+
+
+def look_ahead(request: RunRequest, *, machine: Machine | None = None, progress: Progress = no_progress) -> Ahead:
+    """What this request would do now. Raises ValueError or FileNotFoundError for bad input.
+
+    `machine` is one that was looked at before, for a run of the same size and settings.
+    """
+    capture, jobs = find_sequence(request), jobs_of(request)
+    plan = plan_of(request, capture)
+    size = size_of(capture, plan)
+    chosen = affordable_points(request, jobs)
+    point = chosen[-1].name if chosen else request.preset
+    options = options_of(request, capture, point)
+    root = Path(request.out) / capture.name / "store"
+    if machine is None:
+        question = question_of(plan, size, (options,))
+        machine = machine_of(root.parent, question, jobs, jobs_at_once(request), afresh=not chosen, progress=progress)
+    expected = forecast(size, options, machine, request.stop_after)
+    made, events = _there(request) if root.is_dir() else (Made(), ())
+    return Ahead(
+        capture.name,
+        point,
+        size,
+        tuple(_steps(expected, made, Store(root))),
+        tuple(dict.fromkeys([*_spared(capture, plan, options), *_skips(events)])),
+        tuple(_unknown(capture, chosen != ())),
+        expected,
+        machine.probe.moving,
+        root,
+    )
+
+
+def _there(request: RunRequest) -> tuple[Made, Sequence[Event]]:
+    """What of a run is there, up to the first artefact that is not, and what it told."""
+    jobs, journal = jobs_of(request), Journal()
+    points = affordable_points(request, jobs)
+    jobs.cancel("only looking")
+    engine = Engine(lambda make: lambda stage: There(make(stage)))
+    sequence, run = prepare(request, journal, engine, jobs, points)
+    with suppress(CancelledError):  # at the first that is not there
+        sequence, run = settle(sequence, run, engine, points)
+        sequence.run(request.stop_after)
+    return run.made, journal.events
+
+
+def _steps(expected: Forecast, made: Made, store: Store) -> Iterator[Step]:
+    reached = {stage for stage, last in LAST_OF.items() if last in made.keys}
+    if reached:
+        reached |= set(STAGES[: max(STAGES.index(stage) for stage in reached) + 1])
+    for stage, seconds in expected.seconds.items():
+        left = 1.0
+        if stage == "fit" and stage not in reached:
+            left -= _fitted_frames(made, store) / expected.frames
+        does = "there already" if stage in reached else "goes on" if left < 1 else "runs"
+        yield Step(stage, does, 0.0 if stage in reached else left * seconds / 60)
+
+
+def _fitted_frames(made: Made, store: Store) -> int:
+    """Of the segments that are there."""
+    spans = [store.receipt(key).recipe["options"].get("span", (0, 0)) for key in made.keys.get("segment", ())]
+    return sum(stop - start for start, stop in spans)
+
+
+def _spared(capture: Capture, plan: Plan, options: SequenceOptions) -> Iterator[tuple[str, str]]:
+    """Work that the capture or the settings spare."""
+    fit = options.fit
+    if capture.calibration is not None:
+        yield "solving the cameras", f"they are imported from {capture.calibration.name}/, if the pictures confirm them"
+    if not options.light.enabled:
+        yield "light", "light.enabled is false"
+    if not fit.background.instants:
+        yield "backdrop", "fit.background.instants is 0"
+    if not options.patches.enabled:
+        yield "patches", "patches.enabled is false"
+    if not options.motion.keep_flow:
+        yield "keeping optical flow", "motion.keep_flow is false"
+    if not fit.sh_degree:
+        yield "view dependence", "fit.sh_degree is 0"
+    if not plan.held_out:
+        yield "unseen scores", "no camera is held out"
+    weights = options.evaluate.lpips_weights
+    if why := lacking(Path(weights).resolve() if weights else None):
+        yield "LPIPS", why
+
+
+def _skips(events: Sequence[Event]) -> Iterator[tuple[str, str]]:
+    yield from ((event.label, event.reason) for event in events if event.outcome == "skipped")
+
+
+def _unknown(capture: Capture, pilots: bool) -> Iterator[str]:
+    if capture.calibration is None:
+        yield "the cameras have to be solved, which takes minutes to hours more"
+    if pilots:
+        yield "pilots of --target-psnr"

@@ -1,0 +1,102 @@
+"""`packuv plan`: before a run all of it is ahead, after it nothing, in between what is left; and nothing is written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines import space
+from pipelines.cli import FAILED, OK, WRONG, main
+from pipelines.probe import PROBE
+from tests.pipelines.commands.test_run import CAPTURE, _flat
+from tests.support.golden import SETTINGS
+
+SETS = [part for name, value in _flat(SETTINGS) for part in ("--set", f"{name}={value}")]
+HOW = ["--preset", "draft", "--hold-out", "cam03", *SETS]
+
+
+def planned(out: Path, capsys: pytest.CaptureFixture[str], *more: str, code: int = OK) -> dict[str, Any]:
+    """What `packuv plan --json` says of the tiny capture."""
+    capsys.readouterr()
+    assert main(["plan", str(CAPTURE), "--out", str(out), *HOW, *more, "--json"]) == code
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def does(found: dict[str, Any]) -> dict[str, str]:
+    return {step["stage"]: step["does"] for step in found["stages"]}
+
+
+def test_what_is_ahead_shrinks_as_a_run_goes_on(tmp_path, capsys):
+    before = planned(tmp_path / "new", capsys)
+    assert set(does(before).values()) == {"runs"}
+    assert before["minutes_left"] == before["minutes_in_all"]
+    assert before["minutes_left"][0] < before["minutes_left"][1]
+    assert before["cameras"] == {"fitted": 4, "held_out": 1}
+    assert not (tmp_path / "new").exists(), "a plan leaves nothing where nothing was"
+
+    run = ["run", str(CAPTURE), "--out", str(tmp_path), "--direct", *HOW]
+    assert main([*run, "--stop-after", "flow"]) == OK
+    half = planned(tmp_path, capsys)
+    assert does(half) == {
+        **dict.fromkeys(("sync", "calibrate", "flow"), "there already"),
+        **dict.fromkeys(("fit", "encode", "verify", "evaluate"), "runs"),
+    }
+    assert half["minutes_left"] < before["minutes_left"]
+    (folder,) = (path.parent for path in tmp_path.glob(f"*/{PROBE}"))
+    assert "LPIPS" in {item["what"] for item in half["spared"]}
+
+    assert main(run) == OK
+    whole = planned(tmp_path, capsys)
+    assert set(does(whole).values()) == {"there already"}
+    assert whole["minutes_left"] == [0, 0]
+
+    # Whoever looked before a run finds the forecast beside the fact, however short the run.
+    report = json.loads((folder / "report.json").read_text())
+    rows = {row["what"]: row for row in report["run"]["forecast"]}
+    assert rows["in all"]["forecast"] > 0
+    assert rows["in all"]["fact"] == pytest.approx(sum(rows[stage]["fact"] for stage in does(whole)))
+    assert rows["scene file"]["fact"] == (folder / "scene.mkv").stat().st_size / 1e6
+
+
+def test_what_the_disk_cannot_hold_is_the_last_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(space, "free_bytes", lambda path: 1000)
+    assert main(["plan", str(CAPTURE), "--out", str(tmp_path), *HOW]) == FAILED
+    told = capsys.readouterr()
+    assert "evaluate" in told.out
+    assert "are free; free some, or choose another --out" in told.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_captures_is_planned_as_a_batch_is(tmp_path, capsys):
+    for name in ("a", "b"):
+        shutil.copytree(CAPTURE, tmp_path / "shoot" / name)
+        (tmp_path / "shoot" / name / "capture.toml").write_text(f'name = "{name}"\n')
+    out = tmp_path / "out"
+    how = ["--preset", "draft", *SETS, "--at-once", "1"]
+    assert main(["plan", str(tmp_path / "shoot"), "--out", str(out), *how, "--json"]) == OK
+    found = json.loads(capsys.readouterr().out)
+    assert [(row["sequence"], row["does"], row["why"]) for row in found["sequences"]] == [
+        ("a", "runs", "new"),
+        ("b", "runs", "new"),
+    ]
+    assert found["minutes"] == pytest.approx(
+        sum(step["minutes"] for row in found["sequences"] for step in row["plan"]["stages"]), abs=0.02
+    )
+
+
+@pytest.mark.parametrize(
+    ("source", "more", "message"),
+    [
+        ("nowhere", [], "nowhere"),
+        (str(CAPTURE), ["--tags", "a"], "this is one capture"),
+        (str(CAPTURE), ["--set", "fit.iteration=3"], "iteration"),
+    ],
+)
+def test_what_cannot_be_planned_is_one_sentence(tmp_path, capsys, source, more, message):
+    assert main(["plan", source, "--out", str(tmp_path), *more]) == WRONG
+    assert message in capsys.readouterr().err
