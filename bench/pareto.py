@@ -1,7 +1,7 @@
 """Run time against error: one knob at a time from a base, and the points of the ladder, PSNR against CPU seconds.
 
-    packuv bench pareto CAPTURE --out runs/pareto.json --frames 0:30 --hold-out cam05 cam14 cam23
-    packuv bench pareto CAPTURE --out runs/pareto.json --frames 0:30 --hold-out cam05 cam14 cam23 --knobs iterations uv
+    packuv bench pareto CAPTURE --out runs/pareto.json --frames 0:30 --hold-out cam05,cam14,cam23
+    packuv bench pareto CAPTURE --out runs/pareto.json --frames 0:30 --hold-out cam05,cam14,cam23 --knobs iterations uv
 
 Writes, after every point, the JSON file, a table beside it as .md and a plot as .svg. A point that the file has with
 the same request is not run again, and a run that was stopped goes on: the same command again. The file says of which
@@ -78,6 +78,11 @@ KNOBS: Mapping[str, Mapping[str, Pairs]] = {
     "uv": {str(side): (f"fit.uv.rows={side}", f"fit.uv.columns={side}") for side in (512, 2048)},
     "layers": _one("fit.uv.layers", 4),
     "background": _one("fit.background.instants", 7, 30),
+    "start": {
+        "volume": ("fit.start.surface_share=0",),
+        "surface": ("fit.start.surface_share=1",),
+        "no shell": ("fit.shell.enabled=false",),
+    },
     "births": _one("fit.key_births", 2500, 10_000),
     "precision": {"floats": ("fit.low_precision=false",)},
     "fine": {name: tuple(_pairs(LADDER[name])) for name in ("fine", "high")},

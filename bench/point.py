@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser, *, capture: bool = True) -> N
     parser.add_argument("--work", type=Path, help="folder of the runs (beside --out)")
     parser.add_argument("--preset", choices=PRESETS, default=Base.preset)
     parser.add_argument("--frames", default=":", metavar="A:B")
-    parser.add_argument("--hold-out", nargs="+", metavar="CAMERA")
+    parser.add_argument("--hold-out", type=lambda text: text.split(","), metavar="CAM,CAM")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of every point")
     parser.add_argument("--seed", type=int, default=0)
 

@@ -38,7 +38,7 @@ from packuv.fit.density import DensityOptions
 from packuv.fit.frames import fit_segment
 from packuv.fit.keyframe import KeyState, fit_backdrop, fit_next
 from packuv.fit.options import FirstOptions, FitOptions, FrameOptions, NextOptions
-from packuv.fit.start.first import StartOptions
+from packuv.fit.start.first import ROOM, StartOptions
 from packuv.fit.start.shell import ShellOptions
 from packuv.footage import Views
 from packuv.gaussians.floats import ATTRIBUTES
@@ -164,8 +164,8 @@ def options_of(case: Case) -> FitOptions:
         # All on the shell: as thin as what is fitted long, where balls that fill the room overlap ten times as much.
         start=StartOptions(count=case.gaussians, surface_share=1.0),
         shell=ShellOptions(steps=12),  # the sweep is no iteration; its memory does not depend on this
-        # A backdrop may have 0.88 of the cap, and start with 0.8 of that.
-        density=DensityOptions(cap=math.ceil(case.gaussians / 0.88 / 0.8), every=10**6),
+        # So large that a backdrop may start with all of them.
+        density=DensityOptions(cap=math.ceil(case.gaussians / FirstOptions.backdrop_share / ROOM), every=10**6),
     )
 
 

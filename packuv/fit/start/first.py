@@ -22,7 +22,7 @@ AIR_OPACITY = 0.1
 _ROUNDS = 8
 """Draws of random places before fewer than asked for will do"""
 
-_ROOM = 0.8
+ROOM = 0.8
 """Share of the cap that a fit may start with; the rest is for where detail turns out to be"""
 
 _CANDIDATES = 16
@@ -45,7 +45,7 @@ class StartOptions:
 
     def within(self, cap: int) -> StartOptions:
         """The same for so many Gaussians at most in the end."""
-        return replace(self, count=min(self.count, round(_ROOM * cap)))
+        return replace(self, count=min(self.count, round(ROOM * cap)))
 
 
 def first_gaussians(
