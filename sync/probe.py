@@ -7,6 +7,7 @@ it one (measured: decoders return wrong pictures from MPEG-TS, cut MP4 and AVI w
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -15,11 +16,13 @@ from typing import NamedTuple
 import av
 import numpy as np
 
-from sync.timecode import NANOSECONDS, Timecodes, label_to_frame, labels_to_ns, ticks_to_ns
+from sync.timecode import NANOSECONDS, Timecodes, day_of, label_to_frame, labels_to_ns, ticks_to_ns
+from sync.tmcd import timecode_track_rate
 
 STREAM_FORMATS = frozenset({"mpegts", "mpeg", "h264", "hevc", "vvc", "m4v", "mpegvideo", "mjpeg", "obu", "dv"})
 """Containers without a reliable time per frame: transport and program streams, bare codec streams."""
 PICTURE_FORMATS = frozenset({"image2", "tty", "ico"})
+CONTAINER_TIMES = "the container's times"
 LONGEST_LOSS_S = Fraction(1, 2)
 """A file may end this much before its header says: the last frame's own duration is often wrong."""
 
@@ -81,6 +84,10 @@ class VideoInfo:
     colour: ColourTags
     start_label: str | None = None
     """SMPTE label of the first frame, where the container has one"""
+    label_rate: Fraction | None = None
+    """At which that label counts: its track's own, or the video's"""
+    odd_label: str | None = None
+    """A label that does not exist at that rate, and so is not used"""
 
     def __post_init__(self) -> None:
         if self.pts_ns.shape != (self.frame_count,) or self.frame_count < 1:
@@ -121,10 +128,15 @@ def container_timecodes(info: VideoInfo) -> Timecodes:
     Without a label the times begin where the container's do, which is 0 for most: they align cameras only if all
     recordings were started by one trigger or cut from one timeline.
     """
-    times = info.pts_ns
-    if info.start_label is not None:
-        times = labels_to_ns([info.start_label], info.rate) + (times - times[0])
-    return Timecodes(times, np.arange(len(times), dtype=np.int64))
+    times, rate = info.pts_ns, info.label_rate or info.rate
+    numbers = np.arange(len(times), dtype=np.int64)
+    if info.start_label is None:
+        odd = f"its container's label {info.odd_label} does not exist at {info.rate} frames per second; it is not used"
+        return Timecodes(times, numbers, source=CONTAINER_TIMES, notes=(odd,) if info.odd_label else ())
+    times = labels_to_ns([info.start_label], rate) + (times - times[0])
+    other = f"its container's label counts at {rate} per second, its video runs at {info.rate}"
+    day, notes = day_of(info.start_label, rate), (other,) if rate != info.rate else ()
+    return Timecodes(times, numbers, day, f"the container's label {info.start_label}", notes)
 
 
 def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
@@ -147,6 +159,7 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         raise ValueError(f"{path} has frames with one and the same time; {_reencode(path)}")
     rate = _rate(path, stream, pts_ns)
     gap = int(np.median(np.diff(pts_ns))) if len(pts_ns) > 1 else int(NANOSECONDS / rate)
+    label, label_rate, odd = _start_label(path, container, stream, rate)
     return VideoInfo(
         width=stream.width,
         height=stream.height,
@@ -157,7 +170,9 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         duration_ns=int(pts_ns[-1] - pts_ns[0]) + gap,
         size_bytes=path.stat().st_size,
         colour=ColourTags.of(stream.codec_context),
-        start_label=_start_label(container, stream, rate),
+        start_label=label,
+        label_rate=label_rate,
+        odd_label=odd,
     )
 
 
@@ -229,10 +244,19 @@ def _rate(path: Path, stream: av.VideoStream, pts_ns: np.ndarray) -> Fraction:
     return fits[0] if fits else measured.limit_denominator(1001)
 
 
-def _start_label(container: av.container.InputContainer, stream: av.VideoStream, rate: Fraction) -> str | None:
+def _start_label(
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream, rate: Fraction
+) -> tuple[str | None, Fraction | None, str | None]:
+    """Label of the first frame, the rate it counts at, and one that does not exist at that rate."""
     tracks = [stream.metadata, container.metadata, *(other.metadata for other in container.streams)]
-    label = next((data["timecode"] for data in tracks if "timecode" in data), None)
-    try:
-        return label if label is not None and label_to_frame(label, rate) >= 0 else None
-    except ValueError:
-        return None  # the track counts at another rate than the frames; a wrong time is worse than none
+    # Matroska's writers put it in capitals.
+    found = (value for data in tracks for name, value in data.items() if name.lower() == "timecode")
+    label = next(found, None)
+    if label is None:
+        return None, None, None
+    own = timecode_track_rate(path) if container.format.name.startswith("mov") else None
+    for one in (own, rate):
+        with suppress(ValueError):  # a wrong time is worse than none
+            if one is not None and label_to_frame(label, one) >= 0:
+                return label, one, None
+    return None, None, label
