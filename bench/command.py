@@ -14,6 +14,7 @@ BENCHMARKS = (
     "ablation",
     "codec",
     "kills",
+    "long",
     "motion",
     "pareto",
     "raster",
