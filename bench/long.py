@@ -22,6 +22,7 @@ import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -89,19 +90,19 @@ def lengthen(short: Path, folder: Path, instants: int) -> Path:
     """A capture of so many instants, made unless it is there: the packets of a short one, again and again."""
     if folder.exists():
         return folder
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    shutil.copytree(short, partial, ignore=shutil.ignore_patterns("videos", "timecodes", "truth"))
+    begun = folder.with_name(f"{folder.name}.begun")
+    shutil.rmtree(begun, ignore_errors=True)
+    shutil.copytree(short, begun, ignore=shutil.ignore_patterns("videos", "timecodes", "truth"))
     for part in ("videos", "timecodes"):
-        (partial / part).mkdir()
+        (begun / part).mkdir()
     ticks = (tick_times(instants, SimulateOptions().fps) - EPOCH_NS) // 1000
     rng = np.random.default_rng(0)
     for video in sorted((short / "videos").iterdir()):
-        repeat(video, partial / "videos" / video.name, instants)
+        repeat(video, begun / "videos" / video.name, instants)
         times = EPOCH_NS // 1000 + ticks + rng.integers(-300, 300, instants)
         lines = [f"frame_{time}_{number:012d}" for number, time in enumerate(times.tolist())]
-        (partial / "timecodes" / f"{video.stem}.txt").write_text("\n".join(lines) + "\n")
-    partial.rename(folder)
+        (begun / "timecodes" / f"{video.stem}.txt").write_text("\n".join(lines) + "\n")
+    begun.rename(folder)
     return folder
 
 
@@ -201,6 +202,15 @@ class Case:
         return RunRequest(
             str(self.capture.resolve()), str(self.out.resolve()), preset="draft", settings=SETTINGS, jobs=1, **changes
         )
+
+    def fit(self, few: int) -> dict[str, Any]:
+        """A whole run of twice so many instants from the middle; what was fitted is on record in fitted.json."""
+        middle = self.instants // 2
+        measured = self.run("report", f"{middle - few}:{middle + few}")
+        names = [item["artefact"] for item in json.loads((self.sequence / RUN).read_text())["artefacts"]]
+        kinds = {kind: [name for name in names if name.startswith(f"{kind}/")] for kind in ("key", "segment")}
+        save_json(self.folder / "fitted.json", kinds)
+        return {"instants": 2 * few, **measured}
 
     def run(self, stop_after: str, frames: str = ":") -> dict[str, Any]:
         """A run without the workflow engine: memory of the run itself, open files, and artefacts by stage."""
@@ -448,6 +458,17 @@ def growth(lengths: Mapping[int, Mapping[str, Any]]) -> dict[str, dict[str, floa
     return found
 
 
+def known(folder: Path, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What was measured by an earlier call, or now."""
+    path = folder / "measured" / f"{name}.json"
+    if not path.exists():
+        path.parent.mkdir(exist_ok=True)
+        save_json(path, make())
+    measured: dict[str, Any] = json.loads(path.read_text())
+    print(name, json.dumps(measured), flush=True)
+    return measured
+
+
 def measure(folder: Path, instants: Sequence[int]) -> dict[str, Any]:
     """All lengths."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -458,21 +479,14 @@ def measure(folder: Path, instants: Sequence[int]) -> dict[str, Any]:
         lengthen(short, case.capture, count)
         video = str(sorted((case.capture / "videos").iterdir())[0])
         results[count] = {
-            "probe": alone(folder / "alone", "probe", video),
-            "decode": alone(folder / "alone", "decode", video),
-            "flow": case.run("flow"),
+            "probe": known(folder, f"probe{count}", partial(alone, folder / "alone", "probe", video)),
+            "decode": known(folder, f"decode{count}", partial(alone, folder / "alone", "decode", video)),
+            "flow": known(folder, f"flow{count}", partial(case.run, "flow")),
         }
-        print(json.dumps({count: results[count]}), flush=True)
-    middle = longest.instants // 2
     few = min(FITTED, longest.instants) // 2
-    fit = longest.run("report", f"{middle - few}:{middle + few}")
-    made = json.loads((longest.sequence / RUN).read_text())["artefacts"]
-    names = [item["artefact"] for item in made]
-    kinds = {kind: [name for name in names if name.startswith(f"{kind}/")] for kind in ("key", "segment")}
-    save_json(folder / "fitted.json", kinds)
+    fit = known(folder, "fit", partial(longest.fit, few))
     for count in instants:
-        results[count]["scene"] = scene_of(Case(folder, count), longest)
-        print(json.dumps({count: results[count]["scene"]}), flush=True)
+        results[count]["scene"] = known(folder, f"scene{count}", partial(scene_of, Case(folder, count), longest))
     lengths = {count: _stages(found) for count, found in results.items()}
     return {
         "cameras": CAMERAS,
@@ -480,7 +494,7 @@ def measure(folder: Path, instants: Sequence[int]) -> dict[str, Any]:
         "settings": SETTINGS,
         "threads": THREADS,
         "lengths": results,
-        "fit": {"frames": 2 * few, **fit},
+        "fit": fit,
         "growth": growth(lengths),
     }
 
