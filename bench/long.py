@@ -303,6 +303,7 @@ def report(case: Case) -> dict[str, Any]:
 
 
 def alone(folder: Path, name: str, *words: Any) -> dict[str, Any]:
+    """What a function of this module gives in a process of its own, with what it took."""
     folder.mkdir(parents=True, exist_ok=True)
     job: Job = Alone(name, words)
     start = time.monotonic()
@@ -353,7 +354,8 @@ def repeated(case: Case, store: Store, source: Case | None) -> Iterator[tuple[st
     if source is not None and not plan.exists():
         save_json(plan, {"made": [[label, str(key)] for label, key in _repeat(case, store, source)]})
     for label, name in json.loads(plan.read_text())["made"]:
-        yield label, Key(*name.split("/"), reused=True)
+        stage, digest = name.split("/")
+        yield label, Key(stage, digest, reused=True)
 
 
 def _repeat(case: Case, store: Store, source: Case) -> Iterator[tuple[str, Key]]:

@@ -152,7 +152,8 @@ class _Scorer:
     def _look_before(self, start: int) -> None:
         """Look at each camera's last picture before a frame."""
         there = self._views.frames[:start] >= 0  # [start, C]
-        last = {camera: int(np.flatnonzero(there[:, camera])[-1]) for camera in np.flatnonzero(there.any(axis=0))}
+        cameras = np.flatnonzero(there.any(axis=0)).tolist()
+        last = {camera: int(np.flatnonzero(there[:, camera])[-1]) for camera in cameras}
         for camera, frame in sorted(last.items(), key=lambda item: item[1]):
             self._submit(camera, frame).result()
         for judge in self.judges:
