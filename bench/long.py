@@ -320,12 +320,12 @@ def alone(folder: Path, name: str, *words: Any) -> dict[str, Any]:
 
 
 def assembled(case: Case, source: Case | None = None) -> tuple[Stages, Run]:
-    """A run of the whole capture, whose segments are those of the fit of `source`, repeated; with `source`, they are
-    made unless they are there."""
+    """A run of the whole capture, whose segments are those of the fit of `source`, repeated. With `source`, they are
+    made unless they are there; without it, all of the run is there, and only looked up for its report."""
     journal, jobs = Journal(), Jobs(threads=THREADS)
     engine = Engine(lambda make: lambda stage: There(make(stage)))
     sequence, run = prepare(case.request(), journal, engine, jobs)
-    sequence.run("flow")
+    sequence.run("calibrate" if source else "flow")
     for stage, key in repeated(case, run.workshop.store, source):
         journal.started(stage)
         journal.finished(stage, key, 0.0)

@@ -548,9 +548,7 @@ def long_report() -> ReportInput:
         light=LightCurve(np.random.default_rng(0).normal(0, 0.02, (LONG, 3)), {"cam2": np.zeros((LONG, 3))}),
         motion=MotionCurve(np.random.default_rng(1).random(LONG), tuple(range(0, LONG, 40))),
         scores=scores,
-        scene=SceneFigures(
-            "scene.mkv", 10**9, Fraction(30), tuple(sizes.tolist()), tuple(counts.tolist()), tuple(counts.tolist())
-        ),
+        scene=SceneFigures("scene.mkv", 10**9, Fraction(30), sizes, counts, counts),
         stages=tuple(stages),
     )
 
