@@ -70,7 +70,8 @@ SETTINGS: Mapping[str, Any] = {
     }
 }
 """A fit of seconds, whose memory and artefacts are those of a long one"""
-THREADS = 2
+THREADS = 1
+"""Of what is measured after the fit: on cores that are shared, two that wait for each other would count as work"""
 LOOK_SECONDS = 0.2
 """Between looks at the processes"""
 
@@ -260,8 +261,9 @@ class Alone:
     name: str
     words: tuple[Any, ...]
 
-    def __call__(self, progress: Progress) -> Any:
-        return globals()[self.name](*self.words)
+    def __call__(self, progress: Progress) -> dict[str, Any]:
+        told: dict[str, Any] = globals()[self.name](*self.words)
+        return told
 
 
 def probe(video: str) -> dict[str, Any]:
@@ -494,7 +496,7 @@ def measure(folder: Path, instants: Sequence[int]) -> dict[str, Any]:
         "cameras": CAMERAS,
         "size": SIZE,
         "settings": SETTINGS,
-        "threads": THREADS,
+        "scene_threads": THREADS,
         "lengths": results,
         "fit": fit,
         "growth": growth(lengths),
@@ -505,7 +507,8 @@ def _stages(found: Mapping[str, Any]) -> dict[str, Any]:
     """Every figure with a peak of its own, by name."""
     scene = found["scene"]
     named = {name: found[name] for name in ("probe", "decode")}
-    return named | found["flow"]["stages"] | scene["stages"] | {"report": scene["report"]}
+    stages: dict[str, Any] = named | found["flow"]["stages"] | scene["stages"] | {"report": scene["report"]}
+    return stages
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
