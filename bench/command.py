@@ -15,6 +15,7 @@ BENCHMARKS = (
     "codec",
     "forecast",
     "kills",
+    "long",
     "motion",
     "pareto",
     "raster",

@@ -23,6 +23,8 @@ RIG = "rig.json"
 """Name of the rig's file in artefacts"""
 LIGHT = "light.npz"
 """Name of the file of light and exposures over time in artefacts"""
+PACKETS = ".packets"
+"""Folder in the store for what the packets of long videos tell"""
 HDR_TAGS = ("arib-std-b67", "smpte2084")
 """Tags of videos that say what their code values mean, HLG and PQ"""
 
@@ -106,6 +108,7 @@ class Footage:
             light=light.of(names, len(frames)) if light else None,
             budget=Budget(self.site.memory_bytes),
             spill=spill,
+            reader=self._reader({name: videos[name] for name in names}),
         )
 
     def load_light(self) -> Light | None:
@@ -144,7 +147,10 @@ class Footage:
     def open_reader(self) -> FrameReader:
         """Pictures as filmed, by camera and number of the frame."""
         videos = find_capture(self.site.capture).videos
-        return FrameReader({name: videos[name] for name in self.take.cameras}, transfer=self.take.pictures.transfer)
+        return self._reader({name: videos[name] for name in self.take.cameras})
+
+    def _reader(self, videos: Mapping[str, Path]) -> FrameReader:
+        return FrameReader(videos, transfer=self.take.pictures.transfer, kept=self.site.store / PACKETS)
 
     def load_frames(self) -> dict[str, np.ndarray]:
         """By camera the number of its frame at each instant of the take, int [T], -1 where it has none."""
