@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.process import CORES_PER_JOB
+from pipelines.crew import CORES_PER_JOB
 
 BYTES_PER_SEQUENCE = 3_000_000_000
 """A fit with 80,000 Gaussians and its pictures takes 2.3 GB"""

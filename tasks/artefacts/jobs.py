@@ -181,10 +181,10 @@ class Jobs:
                 f"the job {job} ended without a result ({_described(code)}); its output is in {log}", log
             )
         if "error" in last:
-            raised = _exception(last["error"], log)
-            if isinstance(raised, JobError) or (type(raised) is OSError and not raised.errno):
+            error = raised(last["error"], log)
+            if isinstance(error, JobError) or (type(error) is OSError and not error.errno):
                 _blame_disk(log.parent)
-            raise raised
+            raise error
         return Done(last["result"], last["peak_memory_bytes"], last["cpu_seconds"], last["cpu"])
 
 
@@ -256,14 +256,15 @@ def _blame_disk(folder: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
-def _exception(error: Mapping[str, Any], log: Path) -> Exception:
+def raised(error: Mapping[str, Any], log: Path) -> Exception:
+    """What `told` told, of a kind that callers know; else a JobError."""
     for kind in RAISED_AS:
         if kind.__name__ in error["kinds"]:
-            raised = kind(error["message"])
-            if isinstance(raised, OSError):
-                raised.errno, raised.strerror, raised.filename = error["errno"], error["strerror"], error["filename"]
-            raised.add_note(f"the job's own traceback is in {log}")
-            return raised
+            found = kind(error["message"])
+            if isinstance(found, OSError):
+                found.errno, found.strerror, found.filename = error["errno"], error["strerror"], error["filename"]
+            found.add_note(f"the job's own traceback is in {log}")
+            return found
     return JobError(f"{error['kinds'][0]}: {error['message']}; the traceback is in {log}", log)
 
 
@@ -314,10 +315,11 @@ def _result(job: Path, progress: Progress) -> dict[str, Any]:
     except Exception as error:
         with contextlib.suppress(OSError):  # a full disk has no room for the log either
             traceback.print_exc()
-        return {"error": _told(error)}
+        return {"error": told(error)}
 
 
-def _told(error: Exception) -> dict[str, Any]:
+def told(error: Exception) -> dict[str, Any]:
+    """An exception as plain values, which `raised` takes back."""
     system = error if isinstance(error, OSError) else OSError()
     return {
         "kinds": [kind.__name__ for kind in type(error).__mro__],
