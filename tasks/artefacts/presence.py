@@ -49,6 +49,11 @@ def own_name() -> str:
     return f"{host}-{machine()}-{os.getpid()}-{_started(os.getpid())}-{secrets.token_hex(4)}"
 
 
+def is_name(text: str) -> bool:
+    """Whether `own_name` gave it, on whichever machine."""
+    return bool(_parts(text)[0])
+
+
 def is_here(name: str) -> bool:
     """Whether a name is that of a process of this machine."""
     return _parts(name)[0] == machine()

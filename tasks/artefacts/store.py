@@ -32,7 +32,7 @@ from typing import Any, BinaryIO
 
 from tasks.artefacts import recipe
 from tasks.artefacts.digests import file_digest
-from tasks.artefacts.presence import Beat, LostError, is_alive, is_ended, look_afresh, own_name
+from tasks.artefacts.presence import Beat, LostError, is_alive, is_ended, is_name, look_afresh, own_name
 from tasks.artefacts.recipe import naming, write_json
 
 RECEIPT = "receipt.json"
@@ -440,7 +440,7 @@ def _is_whole(folder: Path) -> bool:
 
 def _attempts(shelf: Path) -> list[Path]:
     """Folders in which an artefact is or was built, those of which nobody took anything yet."""
-    return [place for place in shelf.glob("[!.]*/") if not place.name.startswith(OVERTAKEN)]
+    return [place for place in shelf.glob("[!.]*/") if is_name(place.name) and not place.name.startswith(OVERTAKEN)]
 
 
 def _goes_on(place: Path) -> bool:
