@@ -17,6 +17,7 @@ BENCHMARKS = (
     "motion",
     "pareto",
     "raster",
+    "scaling",
     "sequence",
     "size",
     "skips",
