@@ -59,7 +59,15 @@ def fulfil(asked: Order, progress: Progress = no_progress, check: Callable[[], N
         jobs = Jobs(threads=needs.cores, memory_bytes=site.memory_bytes)
         files = Seen(Path(asked["capture"]), asked["seen"])
         with Store(site.store).in_use():
-            key = make_by_job(stage, site, jobs, originals=files.look, progress=progress, check=check)
+            key = make_by_job(
+                stage,
+                site,
+                jobs,
+                originals=files.look,
+                progress=progress,
+                waiting=lambda: progress(0, 0, "waiting for another machine that makes the same"),
+                check=check,
+            )
         return {"host": socket.gethostname(), "reused": key.reused}
     except (JobError, ValueError, OSError, MemoryError) as error:
         log = getattr(error, "log", None)

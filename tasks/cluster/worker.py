@@ -56,7 +56,7 @@ class _Telling:
         self._due = 0.0
 
     def __call__(self, done: float, total: float, note: str = "") -> None:
-        if time.monotonic() >= self._due or done >= total:
+        if time.monotonic() >= self._due or 0 < total <= done:
             self._due = time.monotonic() + TELL_SECONDS
             told = {"ticket": self._ticket, "done": float(done), "total": float(total), "note": note}
             self._worker.log_event(self._topic, told)
