@@ -9,6 +9,7 @@ import tempfile
 import time
 from typing import Any
 
+import dask.config
 from distributed import Worker, get_worker
 from distributed.core import Status
 
@@ -69,7 +70,11 @@ def serve(address: str, offer: Needs, *, host: str | None, name: str | None, rea
     """
     for logger in ("distributed", "distributed.worker", "distributed.core"):
         logging.getLogger(logger).setLevel(logging.CRITICAL)
-    with tempfile.TemporaryDirectory(prefix="packuv-worker-") as folder:
+    # What its threads do is to wait for processes, which needs no profile.
+    with (
+        dask.config.set({"distributed.worker.profile.enabled": False}),
+        tempfile.TemporaryDirectory(prefix="packuv-worker-") as folder,
+    ):
         return asyncio.run(_serve(address, offer, host, name, folder, ready))
 
 

@@ -52,9 +52,7 @@ def test_every_job_fits_on_a_worker_and_no_worker_has_more_than_it_offers(found)
 
 
 def test_workers_that_could_never_do_a_fit_are_refused():
-    with pytest.raises(
-        ValueError, match=r"a fit needs 1 core, 3\.0 GB, and none of 2 workers .*largest: 8 cores"
-    ):
+    with pytest.raises(ValueError, match=r"a fit needs 1 core, 3\.0 GB, and none of 2 workers .*largest: 8 cores"):
         spread_over([Needs(8, 2 * 10**9), Needs(8, 10**9)], request())
 
 
