@@ -78,17 +78,20 @@ def is_alive(path: Path, name: str | None = None) -> bool:
 def clock(folder: Path) -> float:
     """Seconds since the epoch, as the server of this folder has them.
 
-    That something is made and removed here has the system forget what it thought it knew of the folder.
+    That something is made and removed here has the system forget what it thought it knew of the folder. Who may not
+    write here gets this machine's time.
     """
-    with tempfile.NamedTemporaryFile(dir=folder, prefix=".clock-") as file:
-        os.utime(file.fileno())
-        return os.fstat(file.fileno()).st_mtime
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".clock-") as file:
+            os.utime(file.fileno())
+            return os.fstat(file.fileno()).st_mtime
+    except OSError:
+        return time.time()
 
 
 def look_afresh(folder: Path) -> None:
     """Have the next look at what is in a folder ask the server, where it is on one."""
-    with contextlib.suppress(OSError):  # not there, or not ours to write to
-        clock(folder)
+    clock(folder)
 
 
 class Beat:

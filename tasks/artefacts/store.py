@@ -445,7 +445,7 @@ def _attempts(shelf: Path) -> list[Path]:
 
 def _goes_on(place: Path) -> bool:
     """Whether somebody builds here."""
-    return is_alive(place) and not (place / RELEASED).exists()
+    return not (place / RELEASED).exists() and is_alive(place)
 
 
 def _take_over(left: Sequence[Path], own: Path) -> None:

@@ -1,4 +1,4 @@
-"""A run over a cluster: client, scheduler and a worker are killed midway, and the same command comes to the same bytes."""
+"""A run over a cluster: client, scheduler and worker are killed midway, and the same command makes the same bytes."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def jobs_in(store: Path) -> list[int]:
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    simulate(tmp_path / "capture", SimulateOptions(5, 12, (96, 64), seed=3, name="tiny"))
+    simulate(tmp_path / "capture", SimulateOptions(5, 12, "96x64", seed=3, name="tiny"))
     return tmp_path
 
 
