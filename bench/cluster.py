@@ -35,7 +35,9 @@ class LocalCluster:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for process in [*self.workers, self.scheduler]:
+        for process in (every := [*self.workers, self.scheduler]):
+            process.terminate()
+        for process in every:
             end(process)
 
     def start_scheduler(self) -> None:

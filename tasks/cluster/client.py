@@ -27,7 +27,7 @@ from tasks.cluster.worker import work
 
 CONNECT_SECONDS = 10.0
 """To find the scheduler"""
-FIRST_WORKER_SECONDS = 30.0
+FIRST_WORKER_SECONDS = 60.0
 """For a first worker to join"""
 POLL_SECONDS = 0.5
 LOOK_SECONDS = 5.0
@@ -109,16 +109,19 @@ class Cluster:
             if time.monotonic() - able > PATIENCE_SECONDS:
                 self._leave(workshop, f"no worker that could {stage.label} is left at {self.address}")
         workshop.jobs.check()
-        if future.status not in ("finished", "error"):  # cancelled, but not by us
-            self._leave(workshop, f"the scheduler {self.address} has gone, or somebody cancelled {stage.label!r} there")
         try:
             found: Answer = future.result(timeout=CONNECT_SECONDS)
             return found
         except KilledWorker as error:
-            log = workshop.store.root
-            raise JobDiedError(f"the workers that did {stage.label!r} died one after the other", log) from error
+            key = workshop.store.key(stage.name, stage.version, stage.settings, stage.sources)
+            died = f"the workers that did {stage.label!r} died one after the other"
+            raise JobDiedError(died, workshop.store.work_folder(key)) from error
         except ImportError as error:
             raise ValueError(f"a worker at {self.address} has no PackUV ({error}); install it there") from error
+        except FutureCancelledError as error:  # not by us
+            lost = getattr(error, "reason", "") == "scheduler-connection-lost"
+            cancelled = f"somebody cancelled {stage.label!r} at the scheduler {self.address}"
+            self._leave(workshop, f"the scheduler {self.address} has gone" if lost else cancelled)
         except GONE as error:
             self._leave(workshop, f"the scheduler {self.address} has gone ({type(error).__name__})")
 
@@ -170,7 +173,7 @@ class Cluster:
 def connected(address: str) -> Iterator[Cluster]:
     """The cluster of a scheduler while the block runs; whatever is under way at its end is cancelled.
 
-    Raises ValueError where no scheduler answers, or no worker has joined within half a minute.
+    Raises ValueError where no scheduler answers, or no worker has joined within a minute.
     """
     for logger in ("distributed", "distributed.client", "distributed.core", "distributed.comm", "distributed.batched"):
         logging.getLogger(logger).setLevel(logging.CRITICAL)

@@ -18,7 +18,7 @@ from studio.capture import SimulateOptions, simulate
 from tasks.artefacts.store import Store
 from tests.support.places import ROOT
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 WORKERS = 3
 SECONDS = 240.0
 """For a stage to come to pass, on a machine that is busy"""
