@@ -28,6 +28,7 @@ class LocalCluster:
     """Beside that of this process"""
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
     address: str = ""
+    scheduler: subprocess.Popen[bytes] = field(init=False)
 
     def __enter__(self) -> LocalCluster:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -35,13 +36,16 @@ class LocalCluster:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for process in (every := [*self.workers, self.scheduler]):
+        every = [*self.workers, self.scheduler]
+        for process in every:
             process.terminate()
         for process in every:
             end(process)
 
     def start_scheduler(self) -> None:
         """A new one, which knows nothing, at the address of the last one."""
+        if self.address:
+            end(self.scheduler)
         port = self.address.rpartition(":")[2] or "0"
         told = self.folder / "scheduler.json"
         told.unlink(missing_ok=True)

@@ -191,6 +191,8 @@ class Store:
                 if self.appeared(key):
                     break
                 place = self._claim(key)
+                if self.appeared(key):  # somebody came to an end just before the claim
+                    break
                 if place is not None:
                     with contextlib.suppress(LostError):
                         self._build(key, place, what, build, originals, lock)
@@ -297,11 +299,13 @@ class Store:
     def _claim(self, key: Key) -> Path | None:
         """A folder to build in, with what an attempt left that does not go on; None while another one does."""
         shelf = self.work_folder(key)
-        shelf.mkdir(parents=True, exist_ok=True)
         if any(map(_goes_on, _attempts(shelf))):
             return None
         own = shelf / own_name()
-        own.mkdir()
+        try:
+            own.mkdir(parents=True)
+        except FileNotFoundError:  # somebody came to an end, and removed the shelf
+            return None
         look_afresh(shelf)
         others = [other for other in _attempts(shelf) if other != own]
         if any(map(_goes_on, others)):  # both came at once: who looked last sees the other
