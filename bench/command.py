@@ -19,6 +19,7 @@ BENCHMARKS = (
     "motion",
     "pareto",
     "raster",
+    "scaling",
     "sequence",
     "size",
     "skips",

@@ -1,7 +1,8 @@
 """Runs that are under way, on record where everybody can read them: <out>/<sequence>/.running/<id>.json.
 
 A run holds a lock as long as it lives, and the kernel frees it however the run ends. A record whose lock is free is
-that of a run which was killed; whoever finds it closes it. No server is needed for that.
+that of a run which was killed; whoever finds it closes it. No server is needed for that. Locks may not reach other
+machines, so a run also renews the time of the lock's file, see `tasks.artefacts.presence`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pipelines.events import Event, Forecast
+from tasks.artefacts.presence import Beat, is_alive, is_here, machine, own_name
 from tasks.artefacts.recipe import restore, write_json
 from tasks.artefacts.retention import RUN
 from tasks.artefacts.store import try_lock
@@ -24,8 +26,6 @@ from tasks.artefacts.store import try_lock
 RUNNING = ".running"
 SAVE_SECONDS = 2.0
 """Least time between two notes of progress"""
-SILENT_SECONDS = 120.0
-"""A run on another machine, whose lock this one may not see, counts as killed after such a silence"""
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,13 @@ class RunRecord:
     stages: tuple[Moving, ...] = ()
     ended: int = 0
     """Stages that came to an end"""
+    process: str = ""
+    """Name of the process for all machines, see `tasks.artefacts.presence.own_name`"""
+
+    @property
+    def here(self) -> bool:
+        """Whether `pid` means a process of this machine."""
+        return is_here(self.process)
 
 
 @dataclass(frozen=True)
@@ -139,13 +146,14 @@ def registered(
     place = folder / RUNNING
     place.mkdir(parents=True, exist_ok=True)
     started, host = datetime.now(UTC), socket.gethostname()
-    path = place / f"{started:%Y%m%dT%H%M%S%f}-{os.getpid()}.json"
+    path = place / f"{started:%Y%m%dT%H%M%S%f}-{os.getpid()}-{machine()}.json"
     when = started.isoformat(timespec="seconds")
-    record = RunRecord(sequence, capture, preset, host, os.getpid(), when, when, engine)
+    record = RunRecord(sequence, capture, preset, host, os.getpid(), when, when, engine, process=own_name())
     with open(_lock_of(path), "ab") as lock:
         try_lock(lock.fileno())
         try:
-            yield Register(path, record)
+            with Beat(_lock_of(path), again=True):
+                yield Register(path, record)
         finally:
             Found(path, record, alive=False).close()
 
@@ -186,8 +194,7 @@ def _alive(path: Path, record: RunRecord) -> bool:
     with contextlib.suppress(FileNotFoundError), open(_lock_of(path), "rb") as lock:
         if not try_lock(lock.fileno(), shared=True):
             return True
-    silence = datetime.now(UTC) - datetime.fromisoformat(record.updated)
-    return record.host != socket.gethostname() and silence.total_seconds() < SILENT_SECONDS
+    return is_alive(_lock_of(path), record.process)
 
 
 def _lock_of(path: Path) -> Path:
