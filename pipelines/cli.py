@@ -264,6 +264,9 @@ def _batch(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--at-once", type=_positive, default=None, metavar="N", help="sequences at a time (from cores and memory)"
     )
+    command.add_argument(
+        "--pool", default=None, metavar="NAME", help="hand the sequences to the workers of this Prefect work pool"
+    )
     command.add_argument("--jobs", type=_positive, default=1, metavar="N", help="segments of a sequence at once")
     command.add_argument("--dry-run", action="store_true", help="only tell what would run, and why")
     command.add_argument(

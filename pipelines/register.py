@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -24,6 +25,8 @@ from tasks.artefacts.store import try_lock
 RUNNING = ".running"
 SAVE_SECONDS = 2.0
 """Least time between two notes of progress"""
+HEARTBEAT_SECONDS = 20.0
+"""Between two notes at the latest, for those who do not see the lock"""
 SILENT_SECONDS = 120.0
 """A run on another machine, whose lock this one may not see, counts as killed after such a silence"""
 
@@ -76,6 +79,8 @@ class Found:
     path: Path
     record: RunRecord
     alive: bool
+    held: bool = False
+    """Its lock is, as far as this machine sees locks"""
 
     @property
     def folder(self) -> Path:
@@ -103,10 +108,12 @@ class Register:
         self._active: dict[str, Forecast] = {}
         self._ended = 0
         self._saved = 0.0
+        self._guard = threading.Lock()
         self.save()
 
     def began(self, label: str, forecast: Forecast) -> None:
-        self._active[label] = forecast
+        with self._guard:
+            self._active[label] = forecast
         self.save()
 
     def moved(self, label: str, forecast: Forecast) -> None:
@@ -114,18 +121,36 @@ class Register:
             self.save()
 
     def ended(self, event: Event) -> None:
-        self._active.pop(event.label, None)
-        self._ended += 1
+        with self._guard:
+            self._active.pop(event.label, None)
+            self._ended += 1
         self.save()
 
     def told(self, label: str, text: str) -> None: ...
 
     def save(self) -> None:
         """Write the record; a disk that is full must not end the run for it."""
-        self._saved = time.monotonic()
-        stages = tuple(_moving(label, forecast) for label, forecast in self._active.items())
-        with contextlib.suppress(OSError):
+        with self._guard, contextlib.suppress(OSError):
+            self._saved = time.monotonic()
+            stages = tuple(_moving(label, forecast) for label, forecast in self._active.items())
             write_json(self._path, replace(self._record, updated=_now(), stages=stages, ended=self._ended))
+
+    @contextlib.contextmanager
+    def beating(self) -> Iterator[None]:
+        """Write it now and then while the block runs, also through a stage that says nothing for long."""
+        over = threading.Event()
+
+        def beat() -> None:
+            while not over.wait(HEARTBEAT_SECONDS):
+                self.save()
+
+        thread = threading.Thread(target=beat, name="heartbeat", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
 
 
 @contextlib.contextmanager
@@ -145,7 +170,9 @@ def registered(
     with open(_lock_of(path), "ab") as lock:
         try_lock(lock.fileno())
         try:
-            yield Register(path, record)
+            register = Register(path, record)
+            with register.beating():
+                yield register
         finally:
             Found(path, record, alive=False).close()
 
@@ -178,14 +205,18 @@ def find_runs(folder: Path) -> list[Found]:
     for path in sorted((folder / RUNNING).glob("*.json")):
         with contextlib.suppress(OSError, ValueError):  # it ended meanwhile
             record = restore(RunRecord, json.loads(path.read_text()))
-            found.append(Found(path, record, _alive(path, record)))
+            held = _held(path)
+            found.append(Found(path, record, held or _writes(record), held))
     return found
 
 
-def _alive(path: Path, record: RunRecord) -> bool:
+def _held(path: Path) -> bool:
     with contextlib.suppress(FileNotFoundError), open(_lock_of(path), "rb") as lock:
-        if not try_lock(lock.fileno(), shared=True):
-            return True
+        return not try_lock(lock.fileno(), shared=True)
+    return False
+
+
+def _writes(record: RunRecord) -> bool:
     silence = datetime.now(UTC) - datetime.fromisoformat(record.updated)
     return record.host != socket.gethostname() and silence.total_seconds() < SILENT_SECONDS
 
