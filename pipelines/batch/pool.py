@@ -30,7 +30,7 @@ from prefect.client.schemas.filters import (
 from prefect.client.schemas.objects import FlowRun, State, StateType, WorkerStatus
 from prefect.deployments import run_deployment
 from prefect.exceptions import ObjectNotFound
-from prefect.settings import PREFECT_API_REQUEST_TIMEOUT, PREFECT_CLIENT_MAX_RETRIES, temporary_settings
+from prefect.settings import PREFECT_CLIENT_MAX_RETRIES, temporary_settings
 from prefect.states import Cancelled, Cancelling, Crashed, Pending
 from prefect.utilities.callables import parameter_schema
 
@@ -107,7 +107,7 @@ def deployed(client: SyncPrefectClient, pool: str) -> UUID:
 @contextlib.contextmanager
 def opened_pool(name: str, tell: Callable[[str, str], object]) -> Iterator[WorkPool]:
     """The pool for one batch; raises what `check_pool` raises. `tell` hears what people should know, by sequence."""
-    with temporary_settings({PREFECT_API_REQUEST_TIMEOUT: REQUEST_SECONDS}), get_client(sync_client=True) as client:
+    with get_client(sync_client=True, httpx_settings={"timeout": REQUEST_SECONDS}) as client:
         check_pool(client, name)
         yield WorkPool(client, name, deployed(client, name), tell)
 

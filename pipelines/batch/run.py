@@ -94,7 +94,7 @@ class Batch:
         shared = max(1, cores_of() // max(1, self.at_once if request.max_minutes is None else wide))
         self._cores = None if request.pool else shared
         self._pace = Pace(_earlier(self._plan))
-        self._headway = Headway(time.monotonic(), self._pace, self.at_once)
+        self._headway = Headway(time.monotonic(), self._pace, 1 if request.pool else self.at_once)
         self._started = datetime.now(UTC)
         self._running: dict[str, _Running] = {}
         self._waiting = {step.name: step.frames for step in steps}
