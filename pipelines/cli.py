@@ -277,6 +277,9 @@ def _batch(command: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/ and DIR/index.html"
     )
     _which(command)
+    command.add_argument(
+        "--pool", default=None, metavar="NAME", help="hand the sequences to the workers of this Prefect work pool"
+    )
     command.add_argument("--jobs", type=_positive, default=1, metavar="N", help="segments of a sequence at once")
     command.add_argument("--dry-run", action="store_true", help="only tell what would run, and why")
     command.add_argument(

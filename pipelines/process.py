@@ -158,6 +158,7 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     on_record = registered(
         folder, sequence=run.name, capture=request.capture, preset=request.preset, engine=engine.place
     )
+    flow_run = engine.place.flow_run if engine.place else None
     with workshop.store.in_use(), on_record as register, journal.heard_by(register):
         try:
             sequence, run = settle(sequence, run, engine, affordable)
@@ -168,11 +169,12 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
             jobs.cancel()
             journal.wait_until_idle(IDLE_SECONDS)
             with suppress(OSError):  # the first fault counts
-                write_json(folder / RUN, run_json(run, ending_of(error)))
+                write_json(folder / RUN, run_json(run, ending_of(error), flow_run))
                 if isinstance(error, (Exception, KeyboardInterrupt)) and not isinstance(error, CancelledError):
                     _leave_finished(sequence, folder)
             raise
-        write_json(folder / RUN, run_json(replace(run, choice=outcome.choice), Ending("finished", outcome.missed)))
+        finished = Ending("finished", outcome.missed)
+        write_json(folder / RUN, run_json(replace(run, choice=outcome.choice), finished, flow_run))
         return outcome
 
 
