@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.rig import Camera, Rig
 
-_COLMAP_PARAMETERS = {"PINHOLE": 4, "OPENCV": 8, "FULL_OPENCV": 12}
+_COLMAP_PARAMETERS = {"PINHOLE": 4, "OPENCV": 8, "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12}
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _CENTRED_PX = 1e-6
 """How far from the middle a principal point may lie for a format that has none: less than any calibration knows."""
@@ -85,6 +85,7 @@ def _decimals(values: Iterable[float]) -> str:
 def _colmap_model(camera: Camera) -> tuple[str, tuple[float, ...]]:
     base = (camera.fx, camera.fy, camera.cx, camera.cy)
     model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}[len(camera.distortion)]
+    model = "OPENCV_FISHEYE" if camera.fisheye else model
     return model, (base + camera.distortion + (0.0,) * 8)[: _COLMAP_PARAMETERS[model]]
 
 
@@ -92,8 +93,10 @@ def _transforms_frame(camera: Camera) -> dict[str, Any]:
     if len(camera.distortion) > 5:
         raise ValueError(f"camera {camera.name!r}: transforms.json holds no rational lens model; write COLMAP instead")
     pose = np.linalg.inv(camera.camera_from_world) @ _OPENCV_FROM_OPENGL
-    lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False))
+    keys = ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3")
+    lens = dict(zip(keys, camera.distortion, strict=False))
     return {
+        **({"camera_model": "OPENCV_FISHEYE", "is_fisheye": True} if camera.fisheye else {}),
         "file_path": f"images/{camera.name}.png",
         "w": camera.width,
         "h": camera.height,
