@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.importers.names import natural_key
 from calibration.rig import Camera, Rig
 
 _COLMAP_PARAMETERS = {"PINHOLE": 4, "OPENCV": 8, "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12}
@@ -43,7 +44,9 @@ def write_transforms(rig: Rig, path: Path) -> None:
     Raises ValueError for a rational lens model (8 coefficients), which the format cannot hold.
     """
     frames = [_transforms_frame(camera) for camera in rig.cameras]
-    path.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1))
+    fisheye = all(camera.fisheye for camera in rig.cameras)
+    shared = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True} if fisheye else {"camera_model": "OPENCV"}
+    path.write_text(json.dumps({**shared, "frames": frames}, indent=1))
 
 
 def write_poses_bounds(rig: Rig, path: Path, bounds: np.ndarray) -> None:
@@ -52,7 +55,7 @@ def write_poses_bounds(rig: Rig, path: Path, bounds: np.ndarray) -> None:
     The format names no cameras: its rows belong to the videos in the order of their names. Raises ValueError for what
     it cannot hold: lenses, two focal lengths, a principal point off the middle, names out of order.
     """
-    if list(rig.names) != sorted(rig.names) or bounds.shape != (len(rig.cameras), 2):
+    if list(rig.names) != sorted(rig.names, key=natural_key) or bounds.shape != (len(rig.cameras), 2):
         raise ValueError(
             f"poses_bounds.npy needs cameras in the order of their names and two bounds for each, but has {rig.names} "
             f"and bounds {bounds.shape}; sort the rig"

@@ -75,8 +75,13 @@ class Found:
     file: Path
     """From which to read; others may belong to it"""
     format: Format
-    strays: tuple[Path, ...] = ()
-    """Other files of the folder that was searched, of which nothing is read"""
+
+    def strays(self, folder: Path) -> list[Path]:
+        """Other files of a folder, of which nothing is read."""
+        return [path for path in _visible(folder) if path != self.file and not self._belongs(path)]
+
+    def _belongs(self, other: Path) -> bool:
+        return other.parent == self.file.parent and any(fnmatch(other.name, name) for name in self.format.BESIDE)
 
 
 def load_rig(path: Path, names: Sequence[str] | None = None, sizes: Mapping[str, tuple[int, int]] | None = None) -> Rig:
@@ -118,10 +123,10 @@ def find_calibration(path: Path) -> Found:
     for kind in FORMATS:
         for file in files:
             if kind.claims(file):
-                return Found(file, kind, _strays(path, file, kind))
+                return Found(file, kind)
     for file in files:
         if kind := _by_content(file):
-            return Found(file, kind, _strays(path, file, kind))
+            return Found(file, kind)
     raise ValueError(
         f"{path} holds no calibration that we read ({', '.join(kind.KIND for kind in FORMATS)}; see "
         f"docs/calibration.md), only {sorted(entry.name for entry in path.iterdir())[:12]}; correct it, or write "
@@ -154,16 +159,8 @@ def _json_format(data: Any) -> Format | None:
     return cast(Format | None, found)
 
 
-def _strays(folder: Path, file: Path, kind: Format) -> tuple[Path, ...]:
-    return tuple(other for other in _visible(folder) if other != file and not _belongs(other, file, kind))
-
-
 def _visible(folder: Path) -> Iterator[Path]:
     for path in sorted(folder.rglob("*")):
         hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
         if path.is_file() and not hidden and not any(fnmatch(path.name.lower(), name) for name in _PEOPLES):
             yield path
-
-
-def _belongs(other: Path, file: Path, kind: Format) -> bool:
-    return other.parent == file.parent and any(fnmatch(other.name, pattern) for pattern in kind.BESIDE)

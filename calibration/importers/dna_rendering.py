@@ -43,7 +43,7 @@ def read(file: Path, videos: Videos) -> Reading:
                     f"it must hold {_GROUP}, but has {sorted(data)[:8]}; the calibration lies in the _annots.smc"
                 )
             return Reading([_view(name, camera) for name, camera in data[_GROUP].items()])
-    except OSError as problem:
+    except (OSError, RuntimeError) as problem:
         raise ValueError(f"it is no whole HDF5 file ({problem})") from None
 
 

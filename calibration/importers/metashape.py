@@ -11,8 +11,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from calibration.importers.texts import first_line, number, whole
-from calibration.importers.trees import attribute, child, root, text_number
+from calibration.importers.texts import number, whole
+from calibration.importers.trees import attribute, child, root, root_tag, text_number
 from calibration.importers.views import Reading, Videos, View, lens, picture_names, pose_at
 from calibration.rig import Camera
 
@@ -22,10 +22,7 @@ _MOST_SKEW_PX = 0.5
 
 
 def claims(file: Path) -> bool:
-    if file.suffix.lower() != ".xml" or not first_line(file).lstrip().startswith("<"):
-        return False
-    with file.open("rb") as start:
-        return b"<document" in start.read(4096)
+    return file.suffix.lower() == ".xml" and root_tag(file) == "document"
 
 
 def read(file: Path, videos: Videos) -> Reading:

@@ -10,8 +10,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from calibration.importers.texts import first_line
-from calibration.importers.trees import attribute, child, root
+from calibration.importers.trees import attribute, child, root, root_tag
 from calibration.importers.views import OPENCV_FROM_OPENGL, PIXEL_CENTRE, Reading, Videos, View, lens, pose_at
 from calibration.rig import Camera
 
@@ -23,12 +22,8 @@ _FULL_LINES = 1080
 
 
 def claims(file: Path) -> bool:
-    if file.name.endswith((".qca.txt", ".qca")):
-        return True
-    if file.suffix.lower() not in (".xml", ".txt") or not first_line(file).lstrip().startswith("<"):
-        return False
-    with file.open("rb") as start:
-        return b"<calibration" in start.read(4096)
+    named = file.name.lower().endswith((".qca.txt", ".qca"))
+    return named or (file.suffix.lower() in (".xml", ".txt") and root_tag(file) == "calibration")
 
 
 def read(file: Path, videos: Videos) -> Reading:

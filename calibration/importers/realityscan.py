@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.importers.texts import first_line, number, read_text
+from calibration.importers.texts import first_lines, number, read_text
 from calibration.importers.views import OPENCV_FROM_OPENGL, Reading, Videos, View, lens, picture_names, pose_at
 from calibration.rig import Camera
 
@@ -23,7 +23,8 @@ _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 
 
 def claims(file: Path) -> bool:
-    return file.suffix.lower() == ".csv" and {"heading", "pitch", "roll"} <= set(_columns(first_line(file)))
+    wanted = {"heading", "pitch", "roll"}
+    return file.suffix.lower() == ".csv" and any(wanted <= set(_columns(line)) for line in first_lines(file, 2))
 
 
 def read(file: Path, videos: Videos) -> Reading:

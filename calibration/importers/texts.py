@@ -74,13 +74,18 @@ def read_json(path: Path) -> Any:
 
 def first_line(path: Path) -> str:
     """The first line with something in it; empty for what is no text."""
+    return next(iter(first_lines(path, 1)), "")
+
+
+def first_lines(path: Path, count: int) -> list[str]:
+    """The first lines with something in them."""
     with path.open("rb") as file:
         start = file.read(8192)
     try:
         text = start.decode("utf-16" if start.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig", errors="ignore")
     except UnicodeDecodeError:
-        return ""
-    return next((line for line in text.splitlines() if line.strip()), "")
+        return []
+    return [line for line in text.splitlines() if line.strip()][:count]
 
 
 def number(value: Any, what: str) -> float:

@@ -16,6 +16,15 @@ def root(file: Path) -> Element:
         raise FaultError(f"{file} is no XML: {problem}") from None
 
 
+def root_tag(file: Path) -> str:
+    """Name of the outermost element; empty for what is no XML."""
+    try:
+        with file.open("rb") as source:
+            return str(next(ElementTree.iterparse(source, ["start"]))[1].tag)
+    except (ElementTree.ParseError, LookupError, ValueError, StopIteration):
+        return ""
+
+
 def attribute(element: Element, key: str, what: str) -> float:
     if key not in element.attrib:
         raise ValueError(f"{what}: {element.tag} must have {key}, but has {sorted(element.attrib)}")
