@@ -51,4 +51,5 @@ def _view(row: Mapping[str, str], what: str) -> View:
     )
     width, height = (whole(row[side], f"{what}: {side}") for side in ("width", "height"))
     shown = lens(of("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
-    return View((name,), Camera("", width, height, *of("fx", "fy", "cx", "cy"), placed, shown))
+    fx, fy, cx, cy = of("fx", "fy", "cx", "cy")
+    return View((name,), Camera("", width, height, fx, fy, cx, cy, placed, shown))
