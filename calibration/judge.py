@@ -7,7 +7,7 @@ programs. The geometry alone rarely shows it: cameras on a dome still look inwar
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -18,6 +18,7 @@ from calibration.features import Features, pairs_by_look
 from calibration.moved import Standing, find_moved
 from calibration.rig import Rig
 from calibration.triangulate import TriangulateOptions, choose_pairs, detect_all, verified_matches
+from calibration.turned import CLOCKWISE, upright, with_turns
 
 _DEFAULTS = TriangulateOptions()
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -44,20 +45,40 @@ class Judgement:
     """Of `rig`"""
     given: MatchesReport | None
     """Of the calibration as the file gives it; None when its cameras see no common volume"""
+    turned: Mapping[str, int] = field(default_factory=dict)
+    """By how many quarters clockwise the pictures of cameras stand otherwise than when they were calibrated"""
 
     def to_json(self) -> dict[str, Any]:
         given = self.given.to_json() if self.given else None
-        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given}
+        turned = {"turned": dict(self.turned)} if self.turned else {}
+        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned}
 
 
-def judge(rig: Rig, pictures: Mapping[str, np.ndarray], *, options: TriangulateOptions = _DEFAULTS) -> Judgement:
+def judge(
+    rig: Rig,
+    pictures: Mapping[str, np.ndarray],
+    *,
+    turned: Sequence[str] = (),
+    options: TriangulateOptions = _DEFAULTS,
+) -> Judgement:
     """Compare the poses with matches between synchronized pictures, camera -> uint8 [H, W, 3] RGB.
 
     Poses that the pictures reject are read again in other conventions, and the one they accept is taken. When they
-    accept none, the given rig comes back with `Verdict.REJECTED`. Raises ValueError for pictures that do not fit the
-    rig, and when no reading gives the cameras a common volume.
+    accept none, the given rig comes back with `Verdict.REJECTED`. The pictures of the cameras `turned` were turned
+    clockwise by a quarter, which may have been the wrong way (`calibration.turned`). Raises ValueError for pictures
+    that do not fit the rig, and when no reading gives the cameras a common volume.
     """
     features = detect_all(rig, pictures, options=options.features)
+    if turned:
+        evidence = verified_matches(rig, features, pairs_by_look(features, ratio=options.ratio), ratio=options.ratio)
+        further = upright(rig, turned, evidence, options=options.judge)
+        rig = with_turns(rig, further)
+        judgement = _judge(rig, features, options)
+        return replace(judgement, turned={name: CLOCKWISE + turn for name, turn in further.items()})
+    return _judge(rig, features, options)
+
+
+def _judge(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> Judgement:
     given = _report(rig, features, options)
     if given is not None and given.verdict is not Verdict.REJECTED:
         return Judgement(rig, Reading.AS_GIVEN, given, given)

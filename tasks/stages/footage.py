@@ -184,4 +184,4 @@ def lens_camera(camera: Camera) -> LensCamera:
     pinhole = PinholeCamera(
         camera.name, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.camera_from_world
     )
-    return LensCamera(pinhole, camera.distortion, camera.gains, camera.shading)
+    return LensCamera(pinhole, camera.distortion, camera.gains, camera.shading, camera.fisheye)
