@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from calibration.accept import MatchesReport, PairMatches, Verdict, matches_report
+from calibration.doubt import doubts
 from calibration.features import Features, pairs_by_look
 from calibration.moved import Standing, find_moved
 from calibration.rig import Rig
@@ -47,11 +48,14 @@ class Judgement:
     """Of the calibration as the file gives it; None when its cameras see no common volume"""
     turned: Mapping[str, int] = field(default_factory=dict)
     """By how many quarters clockwise the pictures of cameras stand otherwise than when they were calibrated"""
+    doubts: Mapping[str, str] = field(default_factory=dict)
+    """What speaks against single cameras, or all of them (`calibration.doubt`)"""
 
     def to_json(self) -> dict[str, Any]:
         given = self.given.to_json() if self.given else None
         turned = {"turned": dict(self.turned)} if self.turned else {}
-        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned}
+        doubts = {"doubts": dict(self.doubts)} if self.doubts else {}
+        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned, **doubts}
 
 
 def judge(
@@ -79,16 +83,17 @@ def judge(
 
 
 def _judge(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> Judgement:
-    given = _report(rig, features, options)
+    given, evidence = _report(rig, features, options)
     if given is not None and given.verdict is not Verdict.REJECTED:
-        return Judgement(rig, Reading.AS_GIVEN, given, given)
+        found = doubts(rig, evidence, given, judge=options.judge)
+        return Judgement(rig, Reading.AS_GIVEN, given, given, doubts=found)
     pairs = pairs_by_look(features, ratio=options.ratio)
     evidence = verified_matches(rig, features, pairs, ratio=options.ratio)
     for reading in _by_promise(rig, evidence, options):
         other = reread(rig, reading)
-        report = _report(other, features, options)
+        report, seen = _report(other, features, options)
         if report is not None and report.verdict is Verdict.ACCEPTED:
-            return Judgement(other, reading, report, given)
+            return Judgement(other, reading, report, given, doubts=doubts(other, seen, report, judge=options.judge))
     if given is None:
         raise ValueError(
             f"{rig.source}: the cameras see no common volume, and the pictures agree with no other reading"
@@ -158,14 +163,17 @@ def _reread_pose(pose: np.ndarray, reading: Reading) -> np.ndarray:
     return poses[reading]
 
 
-def _report(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> MatchesReport | None:
-    """Matches of neighbouring cameras under the poses; None when the cameras see no common volume."""
+def _report(
+    rig: Rig, features: Mapping[str, Features], options: TriangulateOptions
+) -> tuple[MatchesReport | None, list[PairMatches]]:
+    """Matches of neighbouring cameras, and what the poses make of them; None when they see no common volume."""
     try:
         pairs = choose_pairs(rig, neighbours=options.neighbours)
     except ValueError:
-        return None
+        return None, []
     near = [(first, second) for first, second in pairs if first in features and second in features]
-    return matches_report(rig, verified_matches(rig, features, near, ratio=options.ratio), options=options.judge)
+    evidence = verified_matches(rig, features, near, ratio=options.ratio)
+    return matches_report(rig, evidence, options=options.judge), evidence
 
 
 def _by_promise(rig: Rig, evidence: Sequence[PairMatches], options: TriangulateOptions) -> list[Reading]:

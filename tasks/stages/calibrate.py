@@ -93,7 +93,7 @@ class ImportRig(Stage):
                 'calibration = "solve" into capture.toml to have it solved, or use it as it is with '
                 "--set rig.trust=true"
             )
-        odd = {**_turned(judgement), **_strays(capture, source)}
+        odd = {**_turned(judgement), **_strays(capture, source), **judgement.doubts}
         _save_rig(judgement.rig, self.options, judgement.to_json(), work.out, odd=odd)
         held, verdict = f"{place} holds {kind}", judgement.matches.reason
         return {"source": "import", "given": held, "reading": judgement.reading.value, "verdict": verdict}
