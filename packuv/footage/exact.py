@@ -39,12 +39,13 @@ class ExactDecoder:
         return self._develop(decoded), decoded.pts * float(self._stream.time_base)
 
     def _frame(self, wanted: int) -> av.VideoFrame:
-        keys = self._keys[self._keys <= wanted]
-        ahead = self._at is not None and self._at < wanted and not (keys > self._at + 1).any()
+        count = int(np.searchsorted(self._keys, wanted, side="right"))  # of key frames up to the wanted one
+        last = int(self._keys[count - 1]) if count else -1
+        ahead = self._at is not None and self._at < wanted and last <= self._at + 1
         if ahead and (found := self._decode_until(wanted)):
             return found
         # A demuxer may land after the key frame that is asked for; then the one before it leads there.
-        for key in keys[::-1]:
+        for key in self._keys[:count][::-1]:
             start = int(self._ticks[key])
             self._container.seek(start, stream=self._stream, backward=True)
             self._frames = self._whole_from(start)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -13,12 +15,19 @@ from typing import TYPE_CHECKING
 import av
 import numpy as np
 
+from packuv.files import save_npz
 from packuv.footage.coding import Coding
 from packuv.footage.exact import ExactDecoder
 from packuv.footage.transfer import Transfer
 
 if TYPE_CHECKING:
     from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
+
+
+LONG = 1000
+"""Frames of a video from which on what its packets tell is worth a file"""
+TABLES = 1
+"""Version of these files"""
 
 
 class FrameReader:
@@ -40,8 +49,11 @@ class FrameReader:
         transfer: Transfer | None = None,
         threads: int = 1,
         open_limit: int = 128,
+        kept: Path | None = None,
     ) -> None:
         """`transfer` is what code values mean; None leaves it to the tags: HLG, PQ, or else a finished picture.
+
+        `kept` is a folder for what the packets of long videos tell, so that the next reader need not demux them.
 
         `threads` decode one camera; beyond `open_limit` open decoders the longest unused one is closed.
 
@@ -55,6 +67,7 @@ class FrameReader:
         self._open_limit = open_limit
         self._decoders: OrderedDict[str, TorchDecoder | ExactDecoder] = OrderedDict()
         self._found: dict[str, Packets] = {}
+        self._kept = kept
         self._guard = Lock()
         self._locks = {name: Lock() for name in self.videos}
 
@@ -101,7 +114,7 @@ class FrameReader:
 
     def _packets(self, camera: str) -> Packets:
         if camera not in self._found:
-            self._found[camera] = Packets.read(self.videos[camera])
+            self._found[camera] = Packets.read(self.videos[camera], self._kept)
         return self._found[camera]
 
     def _read(self, camera: str, frame: int) -> np.ndarray:
@@ -173,27 +186,56 @@ class Packets:
         return self.ticks * float(self.base)
 
     @classmethod
-    def read(cls, path: Path) -> Packets:
-        """Raises FileNotFoundError for a missing file, ValueError for one that is no video with a time per frame."""
+    def read(cls, path: Path, kept: Path | None = None) -> Packets:
+        """By demuxing, which reads the whole file; once of a long one, where `kept` is a folder for what it told.
+
+        Raises FileNotFoundError for a missing file, ValueError for one that is no video with a time per frame.
+        """
         if not path.is_file():
             raise FileNotFoundError(f"no video at {path}")
+        table = None if kept is None else kept / f"{_name_of_now(path)}.npz"
+        known = table is not None and table.exists()
         try:
             with av.open(str(path)) as container:
                 stream = container.streams.video[0]
-                # Packets that an edit list cuts away are marked for discarding; no decoder shows them.
-                times = [
-                    (packet.pts, packet.is_keyframe)
-                    for packet in container.demux(stream)
-                    if packet.pts is not None and packet.size and not packet.is_discard
-                ]
+                times = _loaded(table) if table is not None and known else _demuxed(container, stream)
                 base, coding = stream.time_base, Coding.of(stream)
         except (av.FFmpegError, IndexError, ValueError) as error:
             raise ValueError(f"{path} cannot be read as a video ({_first_line(error)}); export it again") from error
-        if not times or base is None:
+        if not len(times) or base is None:
             raise ValueError(f"{path} holds no timed video frames; remux it (ffmpeg -i {path.name} -c copy out.mkv)")
-        times.sort()
-        ticks, keys = np.array(times, dtype=np.int64).T
-        return cls(np.ascontiguousarray(ticks), base, np.flatnonzero(keys), coding)
+        if table is not None and not known and len(times) >= LONG and table.name == f"{_name_of_now(path)}.npz":
+            with suppress(OSError):  # only a memory
+                table.parent.mkdir(parents=True, exist_ok=True)
+                save_npz(table, {"times": times})
+        return cls(np.ascontiguousarray(times[:, 0]), base, np.flatnonzero(times[:, 1]), coding)
+
+
+def _demuxed(container: av.container.InputContainer, stream: av.VideoStream) -> np.ndarray:
+    """When each frame is shown, and whether it is a key frame, int64 [n, 2], in order.
+
+    Packets that an edit list cuts away are marked for discarding; no decoder shows them.
+    """
+    found = (
+        (packet.pts, packet.is_keyframe)
+        for packet in container.demux(stream)
+        if packet.pts is not None and packet.size and not packet.is_discard
+    )
+    times = np.fromiter(found, np.dtype((np.int64, 2)))
+    return times[np.lexsort((times[:, 1], times[:, 0]))]
+
+
+def _loaded(table: Path) -> np.ndarray:
+    with np.load(table) as data:
+        times: np.ndarray = data["times"]
+        return times
+
+
+def _name_of_now(path: Path) -> str:
+    """Another one after each change of a file, by which it is known as git's index knows it."""
+    seen = path.stat()
+    words = (TABLES, path.resolve(), seen.st_size, seen.st_mtime_ns, seen.st_ctime_ns, seen.st_ino)
+    return hashlib.sha256("\0".join(map(str, words)).encode()).hexdigest()
 
 
 def packet_seconds(path: Path) -> np.ndarray:
