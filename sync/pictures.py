@@ -110,8 +110,8 @@ def list_pictures(folder: Path) -> Pictures:
     """The pictures of a folder in order of their numbers.
 
     Raises:
-        FileNotFoundError: no such folder.
-        ValueError: no picture, names that differ by more than a number, or one number twice.
+        FileNotFoundError: no such folder, or no picture in it.
+        ValueError: names that differ by more than a number, or one number twice.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder; a camera's pictures lie in one, as {folder.name}/000000.png")
@@ -120,7 +120,9 @@ def list_pictures(folder: Path) -> Pictures:
     numbered = sorted(filter(_has_number, sizes), key=lambda name: natural_key(os.path.splitext(name)[0]))
     names = [name for name in numbered if sizes[name]]
     if not names:
-        raise ValueError(f"{folder} must hold numbered pictures ({', '.join(sorted(PICTURE_SUFFIXES))}), but has none")
+        raise FileNotFoundError(
+            f"{folder} must hold numbered pictures ({', '.join(sorted(PICTURE_SUFFIXES))}), but has none"
+        )
     return Pictures(
         folder=folder,
         names=tuple(names),

@@ -20,8 +20,9 @@ from hypothesis import strategies as st
 from packuv.budget import Budget
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera, undistorted_camera
+from packuv.footage.packets import packet_seconds
 from packuv.footage.planes import as_planes
-from packuv.footage.reader import FrameReader, packet_seconds
+from packuv.footage.reader import FrameReader
 from packuv.footage.views import Views, _packed, _unpacked
 from tests.support.needs import needs_ffmpeg
 
