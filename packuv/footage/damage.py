@@ -79,10 +79,10 @@ class DamageLog:
         }
 
 
-def told(camera: str, facts: Mapping[str, Any], most: int = 5) -> str:
+def damage_told(camera: str, facts: Mapping[str, Any], most: int = 5) -> str:
     """What `DamageLog.facts` say of a camera, for people.
 
-    >>> told("cam1", {"lost": 1, "concealed": 1, "follows": 14, "frames": [[74, 89]]})
+    >>> damage_told("cam1", {"lost": 1, "concealed": 1, "follows": 14, "frames": [[74, 89]]})
     'cam1: 16 pictures are damaged (1 lost, 1 concealed, 14 predicted from those), frames 74-89; they count as missing'
     """
     counts = {"lost": facts["lost"], "concealed": facts["concealed"], "predicted from those": facts["follows"]}
