@@ -5,8 +5,8 @@ from __future__ import annotations
 import tomllib
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from difflib import get_close_matches
 from fractions import Fraction
@@ -19,11 +19,20 @@ from sync.clock import ClockMode
 from sync.natural import natural_key
 from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
 from sync.probe import VideoInfo, container_timecodes, probe_video
-from sync.timecode import Timecodes, parse_rate, read_shared_timecodes, read_timecodes
+from sync.timecode import SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
 
-TIMECODE_SUFFIXES = (".csv", ".txt", ".json")
 VIDEO_FOLDERS = ("videos", "images", "rgbs", "ims")
 """Where the videos or pictures of the cameras lie: our own layout, then those that data sets publish"""
+BESIDE_TIMECODES = frozenset(
+    {".md", ".pdf", ".html", ".jpg", ".png", ".md5", ".sha256", ".toml", ".yaml", ".yml", ".xml"}
+)
+"""Endings of files in timecodes/ that hold none"""
+UNITS_APART = (-9, -6, -3, 3, 6, 9)
+"""Powers of ten between two units of time"""
+RATE_OFF = 0.1
+"""Share by which timecodes may run faster or slower than the container"""
+LABELS_APART = 1.5
+"""Frames that a label may be off a timecode file: it counts whole ones"""
 SHARED_TIMECODES = "timestamps.csv"
 SETTINGS = "capture.toml"
 SOLVE = "solve"
@@ -244,15 +253,65 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
             does not parse, or its lines do not fit the frames of the video.
     """
     if not capture.timecodes:
-        return {camera: container_timecodes(infos[camera]) for camera in capture.cameras}
-    return file_timecodes(capture, {camera: infos[camera].frame_count for camera in capture.cameras})
+        return together({camera: container_timecodes(infos[camera]) for camera in capture.cameras})
+    frames = {camera: infos[camera].frame_count for camera in capture.cameras}
+    periods = {camera: period for camera in capture.cameras if (period := _period_ns(infos[camera]))}
+    found = together(file_timecodes(capture, frames, periods))
+    labels = {camera: container_timecodes(infos[camera]) for camera in found if infos[camera].start_label}
+    return {
+        camera: codes.noting(
+            *_rate_notes(capture.timecodes[camera], codes, periods.get(camera)), *_label_notes(camera, found, labels)
+        )
+        for camera, codes in found.items()
+    }
 
 
-def file_timecodes(capture: Capture, frames: Mapping[str, int]) -> dict[str, Timecodes]:
+def _period_ns(info: VideoInfo) -> int:
+    """Median time between two frames in the container; 0 for a single one, and for pictures, whose rate is assumed."""
+    return int(np.median(np.diff(info.pts_ns))) if info.frame_count > 1 and not info.numbered else 0
+
+
+def _rate_notes(path: Path, codes: Timecodes, video_ns: int | None) -> Iterator[str]:
+    """Where times run at another rate than the video; raises ValueError where they are off by a unit."""
+    steps = np.diff(codes.times_ns)
+    own = int(np.median(steps[steps > 0])) if (steps > 0).any() else 0
+    if not own or not video_ns:
+        return
+    ratio = own / video_ns
+    for power in UNITS_APART:
+        if abs(ratio / 10.0**power - 1) < RATE_OFF:
+            raise ValueError(
+                f"{path}: frames would be {own / 1e6:.6g} ms apart, but in the video they are {video_ns / 1e6:.6g} ms "
+                "apart, so the unit is another; name the right one in the column, as timestamp_ms"
+            )
+    if abs(ratio - 1) > RATE_OFF:
+        yield f"its timecodes are {own / 1e6:.4g} ms apart, the frames of its video {video_ns / 1e6:.4g} ms"
+
+
+def _label_notes(camera: str, found: Mapping[str, Timecodes], labels: Mapping[str, Timecodes]) -> Iterator[str]:
+    """Where the container's label and the timecode file disagree about when a camera began, seen from the first one."""
+    first = next(iter(found))
+    if camera == first or not {camera, first} <= labels.keys():
+        return
+    by_file, by_label = (
+        int(times[camera].times_ns[0] - times[first].times_ns[0]) for times in (found, together(labels))
+    )
+    steps = np.diff(found[camera].times_ns)
+    if len(steps) and abs(by_file - by_label) > LABELS_APART * float(np.median(np.abs(steps))):
+        yield (
+            f"it begins {by_file / 1e9:+.3f} s after {first} by the timecode files, {by_label / 1e9:+.3f} s by the "
+            "labels in the containers; the files are believed"
+        )
+
+
+def file_timecodes(
+    capture: Capture, frames: Mapping[str, int], periods: Mapping[str, int] | None = None
+) -> dict[str, Timecodes]:
     """Timecodes of these cameras from their files, numbered by the frames of their videos.
 
     Args:
         frames: how many the video has, by camera.
+        periods: time between two of them in the container, ns, by camera, where it is known.
 
     Raises:
         ValueError: as `load_timecodes`.
@@ -266,16 +325,26 @@ def file_timecodes(capture: Capture, frames: Mapping[str, int]) -> dict[str, Tim
     settings = capture.settings
     paths = set(capture.timecodes.values())
     if len(paths) == 1:
-        read = read_shared_timecodes(paths.pop(), capture.cameras, rate=settings.fps, column=settings.timecode_column)
+        read = read_shared_timecodes(
+            paths.pop(), capture.cameras, rate=settings.fps, column=settings.timecode_column, period_ns=periods
+        )
     else:
         read = {
             camera: read_timecodes(
-                capture.timecodes[camera], camera=camera, rate=settings.fps, column=settings.timecode_column
+                capture.timecodes[camera],
+                camera=camera,
+                rate=settings.fps,
+                column=settings.timecode_column,
+                period_ns=(periods or {}).get(camera),
             )
             for camera in frames
         }
     return {
-        camera: numbered(read[camera], capture.videos[camera], count, camera=camera) for camera, count in frames.items()
+        camera: replace(
+            numbered(read[camera], capture.videos[camera], count, camera=camera),
+            source=f"timecodes/{capture.timecodes[camera].name}",
+        )
+        for camera, count in frames.items()
     }
 
 
@@ -289,7 +358,7 @@ def numbered(codes: Timecodes, video: Path, count: int, *, camera: str) -> Timec
         pictures = list_pictures(video)
         places = pictures.places()
         if pictures.counted and len(codes) == int(places[-1]) + 1:
-            return Timecodes(codes.times_ns[places], np.arange(len(places), dtype=np.int64))
+            return replace(codes, times_ns=codes.times_ns[places], indices=np.arange(len(places), dtype=np.int64))
     return codes.numbered(count, camera=camera)
 
 
@@ -394,8 +463,15 @@ def _advice(notes: Iterable[str]) -> str:
 
 def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]:
     inside = folder / "timecodes"
-    files = sorted(inside.iterdir()) if inside.is_dir() else []
-    files = [path for path in files if path.suffix.lower() in TIMECODE_SUFFIXES and not path.name.startswith(".")]
+    there = sorted(inside.iterdir()) if inside.is_dir() else []
+    there = [path for path in there if path.is_file() and not path.name.startswith(".")]
+    files = [path for path in there if path.suffix.lower() in SUFFIXES]
+    unknown = [path for path in there if path.suffix.lower() not in {*SUFFIXES, *BESIDE_TIMECODES}]
+    if unread := [path for path in unknown if path.stem in videos or not files]:
+        raise ValueError(
+            f"timecodes are read from files that end in {', '.join(SUFFIXES)}, but {unread[0]} does not; rename it, "
+            "convert it, or take it out of the folder"
+        )
     shared = [path for path in files if path.name == SHARED_TIMECODES and path.stem not in videos]
     if shared and len(files) == 1:
         return dict.fromkeys(videos, shared[0])

@@ -18,13 +18,15 @@ import av
 import numpy as np
 
 from sync.pictures import USUAL_RATE, Pictures, decode_picture, list_pictures
-from sync.timecode import NANOSECONDS, Timecodes, label_to_frame, labels_to_ns, ticks_to_ns
+from sync.timecode import NANOSECONDS, Timecodes, day_of, label_to_frame, labels_to_ns, ticks_to_ns
+from sync.tmcd import timecode_track_rate
 
 STREAM_FORMATS = frozenset({"mpegts", "mpeg", "h264", "hevc", "vvc", "m4v", "mpegvideo", "mjpeg", "obu", "dv"})
 """Containers without a reliable time per frame: transport and program streams, bare codec streams."""
 PICTURE_FORMATS = frozenset({"image2", "tty", "ico"})
 LOOKED_AT = 64
 """Packets that are decoded to find a picture"""
+CONTAINER_TIMES = "the container's times"
 LONGEST_LOSS_S = Fraction(1, 2)
 """A file may end this much before its header says: the last frame's own duration is often wrong."""
 
@@ -87,8 +89,14 @@ class VideoInfo:
     colour: ColourTags
     start_label: str | None = None
     """SMPTE label of the first frame, where the container has one"""
+    label_rate: Fraction | None = None
+    """At which that label counts: its track's own, or the video's"""
+    odd_label: str | None = None
+    """A label that does not exist at that rate, and so is not used"""
     rotation_deg: int = 0
     """By which the stored picture is turned to be shown, counter-clockwise, a multiple of 90"""
+    numbered: bool = False
+    """Times are the numbers of pictures"""
     notes: tuple[str, ...] = ()
     """What a person should know, one sentence each"""
 
@@ -137,10 +145,17 @@ def container_timecodes(info: VideoInfo) -> Timecodes:
     Without a label the times begin where the container's do, which is 0 for most: they align cameras only if all
     recordings were started by one trigger or cut from one timeline.
     """
-    times = info.pts_ns
-    if info.start_label is not None:
-        times = labels_to_ns([info.start_label], info.rate) + (times - times[0])
-    return Timecodes(times, np.arange(len(times), dtype=np.int64))
+    times, rate = info.pts_ns, info.label_rate or info.rate
+    numbers = np.arange(len(times), dtype=np.int64)
+    if info.numbered:
+        return Timecodes(times, numbers, source=f"the numbers of its pictures, {float(info.rate):g} per second")
+    if info.start_label is None:
+        odd = f"its container's label {info.odd_label} does not exist at {info.rate} frames per second; it is not used"
+        return Timecodes(times, numbers, source=CONTAINER_TIMES, notes=(odd,) if info.odd_label else ())
+    times = labels_to_ns([info.start_label], rate) + (times - times[0])
+    other = f"its container's label counts at {rate} per second, its video runs at {info.rate}"
+    day, notes = day_of(info.start_label, rate), (other,) if rate != info.rate else ()
+    return Timecodes(times, numbers, day, f"the container's label {info.start_label}", notes)
 
 
 def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
@@ -166,6 +181,7 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
     gap = int(np.median(np.diff(pts_ns))) if len(pts_ns) > 1 else int(NANOSECONDS / rate)
     sides = (stream.width, stream.height)
     width, height = sides[::-1] if look.rotation_deg % 180 else sides
+    label, label_rate, odd = _start_label(path, container, stream, rate)
     return VideoInfo(
         width=width,
         height=height,
@@ -176,7 +192,9 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         duration_ns=int(pts_ns[-1] - pts_ns[0]) + gap,
         size_bytes=path.stat().st_size,
         colour=colour,
-        start_label=_start_label(container, stream, rate),
+        start_label=label,
+        label_rate=label_rate,
+        odd_label=odd,
         rotation_deg=look.rotation_deg,
         notes=_stream_notes(path, container, stream),
     )
@@ -235,6 +253,7 @@ def _probe_pictures(pictures: Pictures, rate: Fraction, origin: int | None) -> V
         size_bytes=pictures.size_bytes,
         colour=ColourTags.of(first),
         rotation_deg=round(first.rotation / 90) % 4 * 90,
+        numbered=True,
         notes=pictures.notes(pictures.folder.name),
     )
 
@@ -313,10 +332,19 @@ def _rate(path: Path, stream: av.VideoStream, pts_ns: np.ndarray) -> Fraction:
     return fits[0] if fits else measured.limit_denominator(1001)
 
 
-def _start_label(container: av.container.InputContainer, stream: av.VideoStream, rate: Fraction) -> str | None:
+def _start_label(
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream, rate: Fraction
+) -> tuple[str | None, Fraction | None, str | None]:
+    """Label of the first frame, the rate it counts at, and one that does not exist at that rate."""
     tracks = [stream.metadata, container.metadata, *(other.metadata for other in container.streams)]
-    label = next((data["timecode"] for data in tracks if "timecode" in data), None)
-    try:
-        return label if label is not None and label_to_frame(label, rate) >= 0 else None
-    except ValueError:
-        return None  # the track counts at another rate than the frames; a wrong time is worse than none
+    # Matroska's writers put it in capitals.
+    found = (value for data in tracks for name, value in data.items() if name.lower() == "timecode")
+    label = next(found, None)
+    if label is None:
+        return None, None, None
+    own = timecode_track_rate(path) if container.format.name.startswith("mov") else None
+    for one in (own, rate):
+        with suppress(ValueError):  # a wrong time is worse than none
+            if one is not None and label_to_frame(label, one) >= 0:
+                return label, one, None
+    return None, None, label

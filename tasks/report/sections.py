@@ -111,6 +111,7 @@ def _sync_row(row: CameraReport, sync: SyncReport, limits: Limits) -> View:
     clock = row.clock
     return {
         "camera": row.camera,
+        "source": row.source,
         "offset_ms": clock.offset_ns / 1e6,
         "offset_error_ms": clock.offset_error_ns / 1e6,
         "drift_ppm": clock.drift_ppm,

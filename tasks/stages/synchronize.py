@@ -24,7 +24,7 @@ FOOTAGE = "footage"
 class Synchronize(Stage):
     """Match the frames of all cameras: sync.json, groups.arrow, videos.json and the AVL index of each camera."""
 
-    name, version = "sync", 3
+    name, version = "sync", 4
     videos: Files
     timecodes: Files
     fps: Fraction | None
