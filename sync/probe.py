@@ -12,7 +12,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
 
 import av
 import numpy as np
@@ -105,13 +104,10 @@ class VideoInfo:
             raise ValueError(f"{self.frame_count} frames need as many times, but there are {self.pts_ns.shape}")
 
 
-class _Packet(NamedTuple):
-    """What is kept of a packet: its bytes would be the whole file in memory."""
-
-    pts: int | None
-    duration: int
-    is_corrupt: bool
-    is_discard: bool
+PACKET = np.dtype([("pts", np.int64), ("duration", np.int64), ("corrupt", bool), ("discard", bool)])
+"""What is kept of a packet, 18 bytes: its content would be the whole file in memory"""
+UNTIMED = np.iinfo(np.int64).min
+"""pts of a packet without one"""
 
 
 def probe_video(path: Path, *, rate: Fraction | None = None, origin: int | None = None) -> VideoInfo:
@@ -166,13 +162,14 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
     if name in STREAM_FORMATS:
         raise ValueError(f"{path} is a stream ({name}) in which frames cannot be sought exactly; {_remedy(path, name)}")
     look, colour = _Look(), ColourTags.of(stream.codec_context)
-    packets = [
-        _Packet(packet.pts, packet.duration or 0, packet.is_corrupt, packet.is_discard)
+    seen = (
+        (UNTIMED if packet.pts is None else packet.pts, packet.duration or 0, packet.is_corrupt, packet.is_discard)
         for packet in look.passing(container.demux(stream))
         if packet.size
-    ]
+    )
+    packets = np.fromiter(seen, PACKET)
     _check_whole(path, container, stream, packets)
-    pts = np.sort(np.array(_presentation_times(path, name, stream, packets), dtype=np.int64))
+    pts = np.sort(_presentation_times(path, name, stream, packets))
     assert stream.time_base is not None
     pts_ns = ticks_to_ns(pts, stream.time_base)
     if (np.diff(pts_ns) <= 0).any():
@@ -265,12 +262,12 @@ def _shown(frame: av.VideoFrame) -> tuple[int, int]:
 
 
 def _check_whole(
-    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: list[_Packet]
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: np.ndarray
 ) -> None:
-    if not packets:
+    if not len(packets):
         raise ValueError(f"{path} holds no frames; copy the recording again")
-    broken = next((number for number, packet in enumerate(packets) if packet.is_corrupt), None)
-    if broken is not None:
+    if packets["corrupt"].any():
+        broken = int(packets["corrupt"].argmax())
         raise ValueError(f"{path} is cut short or damaged at frame {broken}; copy the recording again")
     # only MP4 and MOV count samples exactly in their header
     if container.format.name.startswith("mov") and stream.frames > len(packets):
@@ -282,8 +279,8 @@ def _check_whole(
         )
 
 
-def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: list[_Packet]) -> list[int]:
-    hidden = sum(packet.is_discard for packet in packets)
+def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: np.ndarray) -> np.ndarray:
+    hidden = int(packets["discard"].sum())
     if hidden:
         raise ValueError(
             f"{path} was cut without re-encoding: an edit list hides {hidden} of its {len(packets)} frames, and "
@@ -291,9 +288,9 @@ def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: 
         )
     if name == "avi" and stream.codec_context.has_b_frames:
         raise ValueError(f"{path} is an AVI with B-frames, which has no presentation times; {_reencode(path)}")
-    times = [packet.pts for packet in packets if packet.pts is not None]
-    if len(times) < len(packets):
-        raise ValueError(f"{path} has {len(packets) - len(times)} frames without a time; {_reencode(path)}")
+    times: np.ndarray = packets["pts"]
+    if untimed := int((times == UNTIMED).sum()):
+        raise ValueError(f"{path} has {untimed} frames without a time; {_reencode(path)}")
     return times
 
 
@@ -316,10 +313,10 @@ def _declared_end_s(stream: av.VideoStream) -> Fraction | None:
     return sum((Fraction(part) * 60**power for power, part in zip((2, 1, 0), parts, strict=True)), Fraction(0))
 
 
-def _found_end_s(stream: av.VideoStream, packets: list[_Packet]) -> Fraction:
+def _found_end_s(stream: av.VideoStream, packets: np.ndarray) -> Fraction:
     assert stream.time_base is not None
-    last = max((packet.pts or 0) + packet.duration for packet in packets)
-    return last * stream.time_base
+    begins = np.where(packets["pts"] == UNTIMED, 0, packets["pts"])
+    return int((begins + packets["duration"]).max()) * stream.time_base
 
 
 def _rate(path: Path, stream: av.VideoStream, pts_ns: np.ndarray) -> Fraction:

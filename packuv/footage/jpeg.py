@@ -7,6 +7,7 @@ arithmetically coded picture is not looked into.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -18,6 +19,8 @@ _LAST = 128
 """More coefficients than a block has, at once: its end"""
 _LONGEST = 256
 """Bytes of a block at most, and some more"""
+_SCAN = 0xDA
+"""Marker before the coded data"""
 WHOLE, SHORT, LONG, WRONG = range(4)
 _PADDING = 16
 """Bits after the last block from which on they are too many: less than a byte is usual, some encoders add one"""
@@ -32,8 +35,9 @@ def jpeg_fault(file: bytes | memoryview) -> str:
     """What is wrong with a JPEG picture, for people; empty for one that is whole, or of a kind not looked into."""
     content = np.frombuffer(file, np.uint8)
     try:
-        tables, scan = _headers(content)
-    except (IndexError, ValueError):
+        scan = [*_segments(content)][-1][2]
+        tables = _headers(content[:scan].tobytes())
+    except (IndexError, ValueError, ArithmeticError):
         return "its headers are damaged"
     if tables is None:
         return ""
@@ -64,30 +68,38 @@ class _Tables(NamedTuple):
         return -(-self.units // self.interval) if self.interval else 1
 
 
-def _headers(file: np.ndarray) -> tuple[_Tables | None, int]:
-    """The tables, None for kinds that are not looked into, and where the scan begins."""
-    huffman, components, sides, interval, at = dict[int, np.ndarray](), dict[int, tuple[int, int]](), (0, 0), 0, 2
-    while True:
+def _segments(file: np.ndarray) -> Iterator[tuple[int, np.ndarray, int]]:
+    """Markers with what they say and where that ends, up to the one behind which the scan begins."""
+    at, marker = 2, 0
+    while marker != _SCAN:
         while file[at] == 0xFF and file[at + 1] == 0xFF:
             at += 1
         if file[at] != 0xFF:
             raise ValueError
-        marker, size = int(file[at + 1]), int(file[at + 2]) << 8 | int(file[at + 3])
-        body = file[at + 4 : at + 2 + size]
-        at += 2 + size
+        marker, end = int(file[at + 1]), at + 2 + (int(file[at + 2]) << 8 | int(file[at + 3]))
+        yield marker, file[at + 4 : end], end
+        at = end
+
+
+@lru_cache(maxsize=8)
+def _headers(header: bytes) -> _Tables | None:
+    """What the pictures of a video share, mostly; None for kinds that are not looked into."""
+    huffman, components, sides, interval = dict[int, np.ndarray](), dict[int, tuple[int, int]](), (0, 0), 0
+    for marker, body, _ in _segments(np.frombuffer(header, np.uint8)):
         if marker == 0xC4:
             _read_tables(body, huffman)
         elif marker in (0xC0, 0xC1):
             sides = (int(body[1]) << 8 | int(body[2]), int(body[3]) << 8 | int(body[4]))
             if body[0] != 8:
-                return None, 0
+                return None
             components = {int(c[0]): (int(c[1]) >> 4, int(c[1]) & 15) for c in body[6 : 6 + 3 * body[5]].reshape(-1, 3)}
         elif 0xC2 <= marker <= 0xCF and marker not in (0xC8, 0xCC):
-            return None, 0
+            return None
         elif marker == 0xDD:
             interval = int(body[0]) << 8 | int(body[1])
-        elif marker == 0xDA:
-            return _scan(body, huffman, components, sides, interval), at
+        elif marker == _SCAN:
+            return _scan(body, huffman, components, sides, interval)
+    raise ValueError
 
 
 def _scan(
