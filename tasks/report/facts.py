@@ -272,6 +272,8 @@ class ReportInput:
     held_out: tuple[str, ...] = ()
     """Cameras that were never fitted"""
     check: RigReport | None = None
+    footage: tuple[str, ...] = ()
+    """What was read of the videos and what was not, where it is not plain, and which pictures are damaged"""
     colours: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """By camera: how its video says that it codes colour, see `sync.probe.ColourTags`"""
     unlike: Mapping[str, str] = field(default_factory=dict)

@@ -20,9 +20,8 @@ from packuv.progress import Progress
 from packuv.scene import SceneHeader, open_scene
 from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
 from sync.align import AlignOptions, FrameGroups, align
-from sync.capture import find_capture, load_timecodes
+from sync.capture import find_capture, load_timecodes, probe_capture
 from sync.clock import ClockMode
-from sync.probe import probe_video
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.report.facts import FrameScore, frames_to_picture
@@ -141,7 +140,7 @@ def _max_width(extra: Mapping[str, Any]) -> int | None:
 
 def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
     found = find_capture(capture)
-    infos = {camera: probe_video(path) for camera, path in found.videos.items()}
+    infos = probe_capture(found)
     what = "the scene's header: sync"
     reference, tolerance_ns, clock = (field(sync, name, what) for name in ("reference", "tolerance_ns", "clock"))
     if tolerance_ns is not None:

@@ -17,12 +17,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import packuv.footage.reader as reader_module
+import packuv.footage.packets as packets_module
 from packuv.budget import Budget
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera, undistorted_camera
+from packuv.footage.packets import Packets, packet_seconds
 from packuv.footage.planes import as_planes
-from packuv.footage.reader import FrameReader, Packets, packet_seconds
+from packuv.footage.reader import FrameReader
 from packuv.footage.views import Views, _packed, _unpacked
 from tests.support.needs import needs_ffmpeg
 
@@ -88,10 +89,10 @@ def test_what_packets_tell_of_a_long_video_is_kept(tmp_path: Path, monkeypatch: 
     kept = tmp_path / "kept"
     assert FrameReader({"a": tmp_path / "a.mp4"}, kept=kept).frame_count("a") == COUNT
     assert not kept.exists()  # a short one
-    monkeypatch.setattr(reader_module, "LONG", COUNT)
+    monkeypatch.setattr(packets_module, "LONG", COUNT)
     first = Packets.read(tmp_path / "a.mp4", kept)
     with monkeypatch.context() as patched:
-        patched.setattr(reader_module, "_demuxed", lambda *_: pytest.fail("demuxed again"))
+        patched.setattr(packets_module, "_demuxed", lambda *_: pytest.fail("demuxed again"))
         again = Packets.read(tmp_path / "a.mp4", kept)
         reader = FrameReader({"a": tmp_path / "a.mp4"}, kept=kept)
         assert np.array_equal(reader.read_many("a", [33, 2]), numbered()[[33, 2]])
