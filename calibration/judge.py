@@ -74,26 +74,51 @@ def judge(
         further = upright(rig, turned, evidence, options=options.judge)
         rig = with_turns(rig, further)
         judgement = _judge(rig, features, options)
-        return replace(judgement, turned={name: CLOCKWISE + turn for name, turn in further.items()})
+        quarters = {name: CLOCKWISE + turn + judgement.turned.get(name, 0) for name, turn in further.items()}
+        return replace(judgement, turned={**judgement.turned, **{name: turn % 4 for name, turn in quarters.items()}})
     return _judge(rig, features, options)
 
 
 def _judge(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> Judgement:
     given = _report(rig, features, options)
-    if given is not None and given.verdict is not Verdict.REJECTED:
+    fits = given is not None and given.verdict is not Verdict.REJECTED
+    if given is not None and fits and not given.bad_cameras:
         return Judgement(rig, Reading.AS_GIVEN, given, given)
     pairs = pairs_by_look(features, ratio=options.ratio)
     evidence = verified_matches(rig, features, pairs, ratio=options.ratio)
+    if given is not None and fits:
+        return _head_up(rig, given.bad_cameras, features, evidence, given, options) or Judgement(
+            rig, Reading.AS_GIVEN, given, given
+        )
     for reading in _by_promise(rig, evidence, options):
         other = reread(rig, reading)
         report = _report(other, features, options)
         if report is not None and report.verdict is Verdict.ACCEPTED:
             return Judgement(other, reading, report, given)
+    if judgement := _head_up(rig, rig.names, features, evidence, given, options):
+        return judgement
     if given is None:
         raise ValueError(
             f"{rig.source}: the cameras see no common volume, and the pictures agree with no other reading"
         )
     return Judgement(rig, Reading.AS_GIVEN, given, given)
+
+
+def _head_up(
+    rig: Rig,
+    suspects: Sequence[str],
+    features: Mapping[str, Features],
+    evidence: Sequence[PairMatches],
+    given: MatchesReport | None,
+    options: TriangulateOptions,
+) -> Judgement | None:
+    """The judgement with cameras turned over that film upside down; None where that does not clear up all suspects."""
+    turns = {name: turn for name, turn in upright(rig, suspects, evidence, options=options.judge).items() if turn}
+    other = with_turns(rig, turns)
+    report = _report(other, features, options) if turns else None
+    if report is None or report.verdict is not Verdict.ACCEPTED or set(report.bad_cameras) & set(turns):
+        return None
+    return Judgement(other, Reading.AS_GIVEN, report, given, turns)
 
 
 @dataclass(frozen=True)
