@@ -48,14 +48,16 @@ class Judgement:
     """Of the calibration as the file gives it; None when its cameras see no common volume"""
     turned: Mapping[str, int] = field(default_factory=dict)
     """By how many quarters clockwise the pictures of cameras stand otherwise than when they were calibrated"""
+    evidence: Sequence[PairMatches] = ()
+    """Matches of neighbouring cameras, found without the poses"""
     doubts: Mapping[str, str] = field(default_factory=dict)
     """What speaks against single cameras, or all of them (`calibration.doubt`)"""
 
     def to_json(self) -> dict[str, Any]:
         given = self.given.to_json() if self.given else None
         turned = {"turned": dict(self.turned)} if self.turned else {}
-        doubts = {"doubts": dict(self.doubts)} if self.doubts else {}
-        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned, **doubts}
+        doubted = {"doubts": dict(self.doubts)} if self.doubts else {}
+        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned, **doubted}
 
 
 def judge(
@@ -72,33 +74,64 @@ def judge(
     clockwise by a quarter, which may have been the wrong way (`calibration.turned`). Raises ValueError for pictures
     that do not fit the rig, and when no reading gives the cameras a common volume.
     """
+    found = _looked(rig, pictures, turned, options)
+    return replace(found, doubts=doubts(found.rig, found.evidence, found.matches, judge=options.judge))
+
+
+def _looked(
+    rig: Rig, pictures: Mapping[str, np.ndarray], turned: Sequence[str], options: TriangulateOptions
+) -> Judgement:
     features = detect_all(rig, pictures, options=options.features)
     if turned:
         evidence = verified_matches(rig, features, pairs_by_look(features, ratio=options.ratio), ratio=options.ratio)
         further = upright(rig, turned, evidence, options=options.judge)
         rig = with_turns(rig, further)
         judgement = _judge(rig, features, options)
-        return replace(judgement, turned={name: CLOCKWISE + turn for name, turn in further.items()})
+        quarters = {name: CLOCKWISE + turn + judgement.turned.get(name, 0) for name, turn in further.items()}
+        return replace(judgement, turned={**judgement.turned, **{name: turn % 4 for name, turn in quarters.items()}})
     return _judge(rig, features, options)
 
 
 def _judge(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> Judgement:
-    given, evidence = _report(rig, features, options)
-    if given is not None and given.verdict is not Verdict.REJECTED:
-        found = doubts(rig, evidence, given, judge=options.judge)
-        return Judgement(rig, Reading.AS_GIVEN, given, given, doubts=found)
+    given, near = _report(rig, features, options)
+    fits = given is not None and given.verdict is not Verdict.REJECTED
+    if given is not None and fits and not given.bad_cameras:
+        return Judgement(rig, Reading.AS_GIVEN, given, given, evidence=near)
     pairs = pairs_by_look(features, ratio=options.ratio)
     evidence = verified_matches(rig, features, pairs, ratio=options.ratio)
+    if given is not None and fits:
+        return _head_up(rig, given.bad_cameras, features, evidence, given, options) or Judgement(
+            rig, Reading.AS_GIVEN, given, given, evidence=near
+        )
     for reading in _by_promise(rig, evidence, options):
         other = reread(rig, reading)
         report, seen = _report(other, features, options)
         if report is not None and report.verdict is Verdict.ACCEPTED:
-            return Judgement(other, reading, report, given, doubts=doubts(other, seen, report, judge=options.judge))
+            return Judgement(other, reading, report, given, evidence=seen)
+    if judgement := _head_up(rig, rig.names, features, evidence, given, options):
+        return judgement
     if given is None:
         raise ValueError(
             f"{rig.source}: the cameras see no common volume, and the pictures agree with no other reading"
         )
-    return Judgement(rig, Reading.AS_GIVEN, given, given)
+    return Judgement(rig, Reading.AS_GIVEN, given, given, evidence=near)
+
+
+def _head_up(
+    rig: Rig,
+    suspects: Sequence[str],
+    features: Mapping[str, Features],
+    evidence: Sequence[PairMatches],
+    given: MatchesReport | None,
+    options: TriangulateOptions,
+) -> Judgement | None:
+    """The judgement with cameras turned over that film upside down; None where that does not clear up all suspects."""
+    turns = {name: turn for name, turn in upright(rig, suspects, evidence, options=options.judge).items() if turn}
+    other = with_turns(rig, turns)
+    report, seen = _report(other, features, options) if turns else (None, [])
+    if report is None or report.verdict is not Verdict.ACCEPTED or set(report.bad_cameras) & set(turns):
+        return None
+    return Judgement(other, Reading.AS_GIVEN, report, given, turns, seen)
 
 
 @dataclass(frozen=True)

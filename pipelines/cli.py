@@ -198,6 +198,9 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     )
     for name, text in SINGLE.items():
         _run(command(name, "pipelines.commands.run:command", f"{text} (run --stop-after {name})"), stop=False)
+    _adopt(
+        command("adopt", "pipelines.commands.adopt:command", "make capture folders of a published data set, by links")
+    )
     _manifest(
         command("manifest", "pipelines.commands.datasets:manifest", "list the captures of a data set in a Parquet file")
     )
@@ -235,6 +238,16 @@ def _simulate(command: argparse.ArgumentParser) -> None:
     command.add_argument("--rig", choices=("ring", "dome", "front"), default="ring", help="how the cameras stand")
     _seed(command)
     _set(command, "a setting of the simulation")
+
+
+def _adopt(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "dataset", type=Path, metavar="DATASET", help="folder of the data set, or of one of its scenes"
+    )
+    command.add_argument(
+        "--out", type=Path, default=None, metavar="DIR", help="captures go to DIR/<scene>/ (DATASET-captures)"
+    )
+    _json(command)
 
 
 def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:

@@ -76,6 +76,11 @@ class Found:
     """From which to read; others may belong to it"""
     format: Format
 
+    def files(self) -> list[Path]:
+        """The file and those that belong to it."""
+        beside = (path for path in sorted(self.file.parent.iterdir()) if path.is_file() and self._belongs(path))
+        return [self.file, *(path for path in beside if path != self.file)]
+
     def strays(self, folder: Path) -> list[Path]:
         """Other files of a folder, of which nothing is read."""
         return [path for path in _visible(folder) if path != self.file and not self._belongs(path)]

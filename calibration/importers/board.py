@@ -43,7 +43,8 @@ def read(file: Path, videos: Videos) -> Reading:
         raise FaultError(f"{file} is no TOML: {problem}") from None
     inner = data.get("cameras")
     tables = inner if isinstance(inner, dict) and inner else data
-    cameras = {key: table for key, table in tables.items() if isinstance(table, dict) and "matrix" in table}
+    wanted = {"matrix", "rotation"}
+    cameras = {key: table for key, table in tables.items() if isinstance(table, dict) and wanted & set(table)}
     if not cameras:
         raise ValueError(
             "a calibration in TOML has a table for each camera with size, matrix, distortions, rotation and "
@@ -52,7 +53,11 @@ def read(file: Path, videos: Videos) -> Reading:
     posed = {key: table for key, table in cameras.items() if "rotation" in table and not table.get("ignore")}
     if not posed:
         raise ValueError(f"none of the cameras {sorted(cameras)[:8]} has a rotation and a translation; calibrate again")
-    return Reading([_view(key, table) for key, table in posed.items()], _metric(posed))
+    names = {key: _names(key, table) for key, table in posed.items()}
+    own = {of[0]: key for key, of in names.items()}
+    if any(own.get(name, key) != key for key, of in names.items() for name in of[1:]):
+        names = {key: of[:1] for key, of in names.items()}  # one's table is called as another camera
+    return Reading([_view(names[key], table) for key, table in posed.items()], _metric(posed))
 
 
 def _metric(tables: Mapping[str, Mapping[str, Any]]) -> bool:
@@ -60,10 +65,9 @@ def _metric(tables: Mapping[str, Mapping[str, Any]]) -> bool:
     return all("cam_id" in table or "port" in table for table in tables.values())
 
 
-def _view(section: str, table: Mapping[str, Any]) -> View:
-    names = _names(section, table)
+def _view(names: tuple[str, ...], table: Mapping[str, Any]) -> View:
     what = f"camera {names[0]}"
-    for key in ("size", "translation"):
+    for key in ("size", "matrix", "translation"):
         if key not in table:
             raise ValueError(f"{what} needs the key {key}, but has {sorted(table)}")
     width, height = (whole(side, f"{what}: a side of size") for side in _list(table["size"], 2, f"{what}: size"))

@@ -30,7 +30,7 @@ def read(file: Path, videos: Videos) -> Reading:
             raise FileNotFoundError(f"an EasyMocap calibration is intri.yml and extri.yml side by side, but no {path}")
     with about(intri):
         lenses = _storage(intri)
-        names = _listed(lenses)
+        names = _listed(lenses, read_text(intri))
     with about(extri):
         poses = _storage(extri)
         placed = {name: _pose(name, poses) for name in names}
@@ -39,10 +39,13 @@ def read(file: Path, videos: Videos) -> Reading:
         return Reading([view for view in found if view is not None])
 
 
-def _listed(lenses: cv2.FileStorage) -> list[str]:
+def _listed(lenses: cv2.FileStorage, text: str) -> list[str]:
+    """The names that are listed, or, where these are missing or were taken for numbers, those of the matrices."""
     node = lenses.getNode("names")
     items = [node.at(index) for index in range(node.size())] if node.isSeq() else []
-    names = [item.string() if item.isString() else f"{item.real():g}" for item in items]
+    names = [item.string() for item in items if item.isString()]
+    if not names or len(names) < len(items):
+        names = re.findall(r"^K_(.+?)[ \t]*:", text, re.MULTILINE)
     if not names:
         raise ValueError("intri.yml must list its cameras under names")
     return names

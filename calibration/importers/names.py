@@ -81,18 +81,17 @@ def _grouped(views: Sequence[Named], index: int) -> dict[str, list[Camera]]:
 
 
 def _covering(schemes: Sequence[dict[str, list[Camera]]], names: Sequence[str], file: Path) -> dict[str, list[Camera]]:
-    """The cameras of all names, by the first scheme that knows any; one that knows some only is an error."""
+    """The cameras of all names, by the first scheme that knows all; the best one is named where none does."""
+    best, known = schemes[0], dict[str, list[Camera]]()
     for scheme in schemes:
         found = max((_matched(scheme, names, alike) for alike in _ALIKE), key=len)
         if len(found) == len(names):
             return found
-        if found:
-            break
-    else:
-        scheme, found = schemes[0], {}
+        if len(found) > len(known):
+            best, known = scheme, found
     raise ValueError(
-        f"every video needs a camera of its name in {file}; videos without one: {some(set(names) - set(found))}; "
-        f"the file's cameras: {some(scheme)}"
+        f"every video needs a camera of its name in {file}; videos without one: {some(set(names) - set(known))}; "
+        f"the file's cameras: {some(best)}"
     )
 
 

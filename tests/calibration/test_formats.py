@@ -420,6 +420,36 @@ def test_sections_of_pose2sim_and_names_of_anipose(tmp_path):
         load_rig(tmp_path)
 
 
+def test_a_table_called_like_another_camera_stands_for_none(tmp_path):
+    """Pose2Sim counts cameras from 1, aniposelib's tables from 0."""
+    written = replace(FORMATS["anipose"], names=lambda k: f"cam_{k + 1}")
+    write_anipose(written.rig(), tmp_path)
+    check_same(load_rig(tmp_path, [f"cam_{k}" for k in range(1, 6)]), written.rig())
+    with pytest.raises(ValueError, match="videos without one: cam_0; the file's cameras: cam_1"):
+        load_rig(tmp_path, ["cam_0", "cam_1"])
+    text = (tmp_path / "calibration.toml").read_text()
+    (tmp_path / "calibration.toml").write_text(text.replace("matrix", "K", 1))
+    with pytest.raises(ValueError, match="camera cam_1 needs the key matrix, but has"):
+        load_rig(tmp_path)
+
+
+@pytest.mark.parametrize("names", ["{}", "{:02d}", "cam{:02d}", "cam_{}", "camera_{:04d}"])
+def test_numbered_cameras_may_be_called_in_many_ways(tmp_path, names):
+    rig = Rig(tuple(replace(c, name=str(k)) for k, c in enumerate(FORMATS["meta"].rig().cameras, 8)), "")
+    write_meta(rig, tmp_path)
+    videos = [names.format(k) for k in range(8, 13)]
+    assert load_rig(tmp_path, videos).names == tuple(videos)
+
+
+@pytest.mark.parametrize("listed", ["", "names:\n  - 00\n  - 01\n  - 02\n  - 03\n  - 04\n"])
+def test_easyvolcaps_names_may_be_missing_or_look_like_numbers(tmp_path, listed):
+    rig = FORMATS["easyvolcap"].rig()
+    write_easyvolcap(rig, tmp_path)
+    head, rest = (tmp_path / "intri.yml").read_text().split("K_", 1)
+    (tmp_path / "intri.yml").write_text(f"{head.split('names')[0]}{listed}K_{rest}")
+    check_same(load_rig(tmp_path, rig.names, sizes(rig)), rig)
+
+
 def test_rows_without_names_go_in_natural_order(tmp_path):
     written = replace(FORMATS["technicolor"], names="cam{}".format)
     rig = written.rig()

@@ -63,6 +63,8 @@ def turn_picture(picture: np.ndarray, quarters: int) -> np.ndarray:
         pytest.param({"cam0": 3}, True, marks=pytest.mark.slow),
         pytest.param({"cam0": 3}, False, marks=pytest.mark.slow),
         pytest.param(dict.fromkeys(arc(5).names, 3), False, marks=pytest.mark.slow),
+        pytest.param({"cam2": 2}, False, marks=pytest.mark.slow),
+        pytest.param({"cam1": 2, "cam2": 2, "cam4": 2}, False, marks=pytest.mark.slow),
     ],
 )
 def test_the_pictures_tell_which_way_a_video_was_turned(quarters, as_shown):

@@ -280,6 +280,8 @@ def test_timecodes_for_some_cameras_only_are_refused(tmp_path: Path) -> None:
         (("calibration/sparse/0/cameras.bin",), "calibration/sparse/0"),
         (("calibration/transforms.json", "calibration/readme.md"), "calibration/transforms.json"),
         (("calibration/poses_bounds.npy",), "calibration/poses_bounds.npy"),
+        (("calibration/rig.json",), "calibration/rig.json"),
+        (("calibration/colmap/cameras.txt",), "calibration/colmap"),
         (("calibration/intri.yml", "calibration/extri.yml"), "calibration"),
         (("calibration/camera_array.toml",), "calibration/camera_array.toml"),
         (("calibration/intri.yml",), "calibration"),
