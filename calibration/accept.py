@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from calibration.multiview import in_front, sampson_px
-from calibration.rig import Camera, Rig, distort
+from calibration.rig import WIDEST_RAD, Camera, Rig, fisheye_radius, fisheye_turn_rad
 
 _PARALLEL = 1e-3
 """Least eigenvalue of the mean of I - d d^T below which axes d count as parallel: they spread by about 2 degrees"""
@@ -179,8 +179,12 @@ def _folds(camera: Camera) -> bool:
     """Whether pixels at the border have no ray: the lens model cannot be inverted there."""
     x, y = np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9)
     border = np.array([(a, b) for a in x for b in (0, camera.height)] + [(a, b) for a in (0, camera.width) for b in y])
+    if camera.fisheye:  # what lies beyond its widest angle has no ray, but folds nothing
+        reach = np.linalg.norm((border - (camera.cx, camera.cy)) / (camera.fx, camera.fy), axis=1).max()
+        turn = min(fisheye_turn_rad(camera.distortion), float(WIDEST_RAD))
+        return turn < WIDEST_RAD and bool(fisheye_radius(np.array(turn), camera.distortion) < reach)
     plane = camera.plane_from_pixels(border)
-    back = distort(plane, camera.distortion) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    back = camera.distorted(plane) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return bool(np.abs(back - border).max() > 0.5) or not np.all(np.isfinite(back))
 
 
@@ -267,7 +271,7 @@ def matches_report(
 ) -> MatchesReport:
     """Judge poses and lenses by verified matches (`triangulate.verified_matches`)."""
     telling = [pair for pair in _merged(matches) if len(pair.first_pixels) >= options.min_matches]
-    errors = [_pair_errors_px(rig, pair) for pair in telling]
+    errors = [pair_errors_px(rig, pair) for pair in telling]
     shares = [float((error <= options.max_error_px).mean()) for error in errors]
     bad = {pair.key: share for pair, share in zip(telling, shares, strict=True) if share < options.bad_share}
     every = np.concatenate([*errors, np.zeros(0)])
@@ -338,7 +342,7 @@ def _explained(entries: Sequence[tuple[PairMatches, float]]) -> float:
     return sum(share * len(pair.first_pixels) for pair, share in entries) / total
 
 
-def _pair_errors_px(rig: Rig, pair: PairMatches) -> np.ndarray:
+def pair_errors_px(rig: Rig, pair: PairMatches) -> np.ndarray:
     """Sampson distance of each match, infinite where its point lies behind a camera: float64 [K]."""
     first, second = rig[pair.first], rig[pair.second]
     a, b = first.plane_from_pixels(pair.first_pixels), second.plane_from_pixels(pair.second_pixels)

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from calibration.importers.names import natural_key
 from calibration.rig import Camera, Rig
 
-_COLMAP_PARAMETERS = {"PINHOLE": 4, "OPENCV": 8, "FULL_OPENCV": 12}
+_COLMAP_PARAMETERS = {"PINHOLE": 4, "OPENCV": 8, "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12}
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _CENTRED_PX = 1e-6
 """How far from the middle a principal point may lie for a format that has none: less than any calibration knows."""
@@ -43,7 +44,9 @@ def write_transforms(rig: Rig, path: Path) -> None:
     Raises ValueError for a rational lens model (8 coefficients), which the format cannot hold.
     """
     frames = [_transforms_frame(camera) for camera in rig.cameras]
-    path.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1))
+    fisheye = all(camera.fisheye for camera in rig.cameras)
+    shared = {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True} if fisheye else {"camera_model": "OPENCV"}
+    path.write_text(json.dumps({**shared, "frames": frames}, indent=1))
 
 
 def write_poses_bounds(rig: Rig, path: Path, bounds: np.ndarray) -> None:
@@ -52,7 +55,7 @@ def write_poses_bounds(rig: Rig, path: Path, bounds: np.ndarray) -> None:
     The format names no cameras: its rows belong to the videos in the order of their names. Raises ValueError for what
     it cannot hold: lenses, two focal lengths, a principal point off the middle, names out of order.
     """
-    if list(rig.names) != sorted(rig.names) or bounds.shape != (len(rig.cameras), 2):
+    if list(rig.names) != sorted(rig.names, key=natural_key) or bounds.shape != (len(rig.cameras), 2):
         raise ValueError(
             f"poses_bounds.npy needs cameras in the order of their names and two bounds for each, but has {rig.names} "
             f"and bounds {bounds.shape}; sort the rig"
@@ -85,6 +88,7 @@ def _decimals(values: Iterable[float]) -> str:
 def _colmap_model(camera: Camera) -> tuple[str, tuple[float, ...]]:
     base = (camera.fx, camera.fy, camera.cx, camera.cy)
     model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}[len(camera.distortion)]
+    model = "OPENCV_FISHEYE" if camera.fisheye else model
     return model, (base + camera.distortion + (0.0,) * 8)[: _COLMAP_PARAMETERS[model]]
 
 
@@ -92,8 +96,10 @@ def _transforms_frame(camera: Camera) -> dict[str, Any]:
     if len(camera.distortion) > 5:
         raise ValueError(f"camera {camera.name!r}: transforms.json holds no rational lens model; write COLMAP instead")
     pose = np.linalg.inv(camera.camera_from_world) @ _OPENCV_FROM_OPENGL
-    lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False))
+    keys = ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3")
+    lens = dict(zip(keys, camera.distortion, strict=False))
     return {
+        **({"camera_model": "OPENCV_FISHEYE", "is_fisheye": True} if camera.fisheye else {}),
         "file_path": f"images/{camera.name}.png",
         "w": camera.width,
         "h": camera.height,

@@ -7,17 +7,19 @@ programs. The geometry alone rarely shows it: cameras on a dome still look inwar
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
 from calibration.accept import MatchesReport, PairMatches, Verdict, matches_report
+from calibration.doubt import doubts
 from calibration.features import Features, pairs_by_look
 from calibration.moved import Standing, find_moved
 from calibration.rig import Rig
 from calibration.triangulate import TriangulateOptions, choose_pairs, detect_all, verified_matches
+from calibration.turned import CLOCKWISE, upright, with_turns
 
 _DEFAULTS = TriangulateOptions()
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -44,30 +46,54 @@ class Judgement:
     """Of `rig`"""
     given: MatchesReport | None
     """Of the calibration as the file gives it; None when its cameras see no common volume"""
+    turned: Mapping[str, int] = field(default_factory=dict)
+    """By how many quarters clockwise the pictures of cameras stand otherwise than when they were calibrated"""
+    doubts: Mapping[str, str] = field(default_factory=dict)
+    """What speaks against single cameras, or all of them (`calibration.doubt`)"""
 
     def to_json(self) -> dict[str, Any]:
         given = self.given.to_json() if self.given else None
-        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given}
+        turned = {"turned": dict(self.turned)} if self.turned else {}
+        doubts = {"doubts": dict(self.doubts)} if self.doubts else {}
+        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned, **doubts}
 
 
-def judge(rig: Rig, pictures: Mapping[str, np.ndarray], *, options: TriangulateOptions = _DEFAULTS) -> Judgement:
+def judge(
+    rig: Rig,
+    pictures: Mapping[str, np.ndarray],
+    *,
+    turned: Sequence[str] = (),
+    options: TriangulateOptions = _DEFAULTS,
+) -> Judgement:
     """Compare the poses with matches between synchronized pictures, camera -> uint8 [H, W, 3] RGB.
 
     Poses that the pictures reject are read again in other conventions, and the one they accept is taken. When they
-    accept none, the given rig comes back with `Verdict.REJECTED`. Raises ValueError for pictures that do not fit the
-    rig, and when no reading gives the cameras a common volume.
+    accept none, the given rig comes back with `Verdict.REJECTED`. The pictures of the cameras `turned` were turned
+    clockwise by a quarter, which may have been the wrong way (`calibration.turned`). Raises ValueError for pictures
+    that do not fit the rig, and when no reading gives the cameras a common volume.
     """
     features = detect_all(rig, pictures, options=options.features)
-    given = _report(rig, features, options)
+    if turned:
+        evidence = verified_matches(rig, features, pairs_by_look(features, ratio=options.ratio), ratio=options.ratio)
+        further = upright(rig, turned, evidence, options=options.judge)
+        rig = with_turns(rig, further)
+        judgement = _judge(rig, features, options)
+        return replace(judgement, turned={name: CLOCKWISE + turn for name, turn in further.items()})
+    return _judge(rig, features, options)
+
+
+def _judge(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> Judgement:
+    given, evidence = _report(rig, features, options)
     if given is not None and given.verdict is not Verdict.REJECTED:
-        return Judgement(rig, Reading.AS_GIVEN, given, given)
+        found = doubts(rig, evidence, given, judge=options.judge)
+        return Judgement(rig, Reading.AS_GIVEN, given, given, doubts=found)
     pairs = pairs_by_look(features, ratio=options.ratio)
     evidence = verified_matches(rig, features, pairs, ratio=options.ratio)
     for reading in _by_promise(rig, evidence, options):
         other = reread(rig, reading)
-        report = _report(other, features, options)
+        report, seen = _report(other, features, options)
         if report is not None and report.verdict is Verdict.ACCEPTED:
-            return Judgement(other, reading, report, given)
+            return Judgement(other, reading, report, given, doubts=doubts(other, seen, report, judge=options.judge))
     if given is None:
         raise ValueError(
             f"{rig.source}: the cameras see no common volume, and the pictures agree with no other reading"
@@ -137,14 +163,17 @@ def _reread_pose(pose: np.ndarray, reading: Reading) -> np.ndarray:
     return poses[reading]
 
 
-def _report(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> MatchesReport | None:
-    """Matches of neighbouring cameras under the poses; None when the cameras see no common volume."""
+def _report(
+    rig: Rig, features: Mapping[str, Features], options: TriangulateOptions
+) -> tuple[MatchesReport | None, list[PairMatches]]:
+    """Matches of neighbouring cameras, and what the poses make of them; None when they see no common volume."""
     try:
         pairs = choose_pairs(rig, neighbours=options.neighbours)
     except ValueError:
-        return None
+        return None, []
     near = [(first, second) for first, second in pairs if first in features and second in features]
-    return matches_report(rig, verified_matches(rig, features, near, ratio=options.ratio), options=options.judge)
+    evidence = verified_matches(rig, features, near, ratio=options.ratio)
+    return matches_report(rig, evidence, options=options.judge), evidence
 
 
 def _by_promise(rig: Rig, evidence: Sequence[PairMatches], options: TriangulateOptions) -> list[Reading]:

@@ -18,9 +18,10 @@ import numpy as np
 MOST_SIDE_PX, MOST_PIXELS, MOST_NUMBER = 2**15, 2**28, 1e30
 """Of a picture, and of lengths and lens parameters; packuv.bounds has the same"""
 
-
 MOST_SHADING = 2.0
 """Of k1 and of k2; packuv.footage.lens has the same"""
+WIDEST_RAD = np.radians(88.0)
+"""Farthest from the axis that a ray of a fisheye is told apart: beyond, the plane z = 1 is 29 times the depth away"""
 
 
 @dataclass(frozen=True)
@@ -38,16 +39,22 @@ class Camera:
     camera_from_world: np.ndarray
     """Rigid transform, float64 [4, 4]"""
     distortion: tuple[float, ...] = ()
-    """OpenCV's k1 k2 p1 p2 [k3 ...]; empty for a pinhole camera"""
+    """OpenCV's k1 k2 p1 p2 [k3 ...]; empty for a pinhole camera; k1 k2 k3 k4 of OpenCV's fisheye model if `fisheye`"""
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Linear-light factors r g b that bring this camera's pictures to the rig's common colour"""
     shading: tuple[float, float] = (0.0, 0.0)
     """k1, k2: light falls off by exp(k1 r^2 + k2 r^4), of mean 1 over the picture; r is the distance from the principal
     point at depth 1, r = 1 in the corner"""
+    fisheye: bool = False
+    """Whether the lens shows a ray at the angle t from the axis at t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)"""
 
     def __post_init__(self) -> None:
         if not _is_rigid(self.camera_from_world):
             raise ValueError(f"camera {self.name!r}: the pose must be a rigid [4, 4] transform (no mirror, no scale)")
+        if self.fisheye and len(self.distortion) != 4:
+            raise ValueError(
+                f"camera {self.name!r}: OpenCV's fisheye model has 4 coefficients, not {len(self.distortion)}"
+            )
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(
                 f"camera {self.name!r}: OpenCV lens models have 4, 5 or 8 coefficients, not {len(self.distortion)}"
@@ -109,6 +116,31 @@ class Camera:
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
+    def turned(self, quarters: int) -> Camera:
+        """The same camera when its picture is turned clockwise by so many quarters."""
+        camera = self
+        for _ in range(quarters % 4):
+            camera = camera._turned_once()
+        return camera
+
+    def _turned_once(self) -> Camera:
+        """What was at (x, y) is at (height - y, x) then."""
+        turn = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        lens = self.distortion
+        if lens and not self.fisheye:  # tangential terms are a direction in the picture
+            lens = (*lens[:2], lens[3], -lens[2], *lens[4:])
+        return replace(
+            self,
+            width=self.height,
+            height=self.width,
+            fx=self.fy,
+            fy=self.fx,
+            cx=self.height - self.cy,
+            cy=self.cx,
+            camera_from_world=turn @ self.camera_from_world,
+            distortion=lens,
+        )
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points [N, 3] to pixels of the distorted picture [N, 2] and depth [N].
 
@@ -117,13 +149,22 @@ class Camera:
         local = self._local(points)
         depth = local[:, 2]
         plane = local[:, :2] / np.where(np.abs(depth) < 1e-12, 1e-12, depth)[:, None]
-        return distort(plane, self.distortion) * (self.fx, self.fy) + (self.cx, self.cy), depth
+        return self.distorted(plane) * (self.fx, self.fy) + (self.cx, self.cy), depth
+
+    def distorted(self, plane: np.ndarray) -> np.ndarray:
+        """What the lens makes of coordinates on the plane z = 1: float64 [N, 2] to [N, 2]."""
+        return distort_fisheye(plane, self.distortion) if self.fisheye else distort(plane, self.distortion)
 
     def plane_from_pixels(self, pixels: np.ndarray) -> np.ndarray:
-        """Pixels of the distorted picture [N, 2] to undistorted coordinates on the plane z = 1, float64 [N, 2]."""
+        """Pixels of the distorted picture [N, 2] to undistorted coordinates on the plane z = 1, float64 [N, 2].
+
+        What a fisheye shows at `WIDEST_RAD` from its axis or farther comes out at that angle.
+        """
         plane = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion or not len(plane):
             return plane
+        if self.fisheye:
+            return undistort_fisheye(plane, self.distortion)
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
         lens = np.asarray(self.distortion, dtype=np.float64)
         return cv2.undistortPoints(plane[:, None], np.eye(3), lens, criteria=stop).reshape(-1, 2)
@@ -193,12 +234,19 @@ class Rig:
     def load(cls, path: Path) -> Rig:
         """Inverse of `save`; raises ValueError that names the file and what it lacks."""
         try:
-            data = json.loads(path.read_text())
+            return cls.from_json(json.loads(path.read_text()), path)
+        except (RecursionError, json.JSONDecodeError) as problem:
+            raise ValueError(f"{path}: not a rig file ({problem}); docs/calibration.md shows one") from None
+
+    @classmethod
+    def from_json(cls, data: Any, path: Path) -> Rig:
+        """The rig of a file's content; raises ValueError that names the file and what it lacks."""
+        try:
             cameras = tuple(_camera_from_json(item) for item in data["cameras"])
             return cls(cameras, str(data["source"]), bool(data["metric"]))
         except KeyError as missing:
             raise ValueError(f"{path}: a rig file needs the field {missing}; docs/calibration.md lists them") from None
-        except (TypeError, RecursionError, OverflowError, json.JSONDecodeError) as problem:
+        except (TypeError, OverflowError) as problem:
             raise ValueError(f"{path}: not a rig file ({problem}); docs/calibration.md shows one") from None
 
 
@@ -219,6 +267,44 @@ def distort(plane: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     )
 
 
+def distort_fisheye(plane: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """OpenCV's fisheye model (4 coefficients) on coordinates at z = 1: [N, 2] to [N, 2]."""
+    radius = np.linalg.norm(plane, axis=1)
+    angle = np.arctan(radius)
+    factor = fisheye_radius(angle, coefficients) / np.where(radius < 1e-9, 1.0, radius)
+    return plane * np.where(radius < 1e-9, 1.0, factor)[:, None]
+
+
+def undistort_fisheye(plane: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """Inverse of `distort_fisheye`, by bisection of the angle between 0 and `WIDEST_RAD`: [N, 2] to [N, 2]."""
+    radius = np.linalg.norm(plane, axis=1)
+    low, high = np.zeros(len(plane)), np.full(len(plane), min(WIDEST_RAD, fisheye_turn_rad(coefficients)))
+    for _ in range(60):  # halves 1.5 rad down to less than float64 tells apart
+        middle = (low + high) / 2
+        short = fisheye_radius(middle, coefficients) < radius
+        low, high = np.where(short, middle, low), np.where(short, high, middle)
+    factor = np.tan(high) / np.where(radius < 1e-9, 1.0, radius)
+    return plane * np.where(radius < 1e-9, 1.0, factor)[:, None]
+
+
+def fisheye_radius(angle: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """Distance from the principal point, in focal lengths, of rays at these angles from the axis, radians."""
+    k1, k2, k3, k4 = coefficients
+    t2 = angle * angle
+    radius: np.ndarray = angle * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    return radius
+
+
+def fisheye_turn_rad(coefficients: tuple[float, ...]) -> float:
+    """Angle from the axis from which on the model folds back, radians; infinite where it never does before pi."""
+    k1, k2, k3, k4 = coefficients
+    angle = np.linspace(0, np.pi, 4097)
+    t2 = angle * angle
+    slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    folds = np.flatnonzero(slope <= 0)
+    return float(angle[max(folds[0] - 1, 0)]) if len(folds) else float("inf")
+
+
 def _is_rigid(pose: np.ndarray) -> bool:
     if pose.shape != (4, 4) or not np.all(np.isfinite(pose)) or not np.array_equal(pose[3], (0, 0, 0, 1)):
         return False
@@ -229,7 +315,8 @@ def _is_rigid(pose: np.ndarray) -> bool:
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
     numbers = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     lists = {"distortion": list(camera.distortion), "gains": list(camera.gains), "shading": list(camera.shading)}
-    return {"name": camera.name, **numbers, **lists, "camera_from_world": camera.camera_from_world.tolist()}
+    pose = {"camera_from_world": camera.camera_from_world.tolist()}
+    return {"name": camera.name, **numbers, **lists, **({"fisheye": True} if camera.fisheye else {}), **pose}
 
 
 def _camera_from_json(item: Mapping[str, Any]) -> Camera:
@@ -248,4 +335,5 @@ def _camera_from_json(item: Mapping[str, Any]) -> Camera:
         distortion=tuple(item["distortion"]),
         gains=tuple(item["gains"]),
         shading=tuple(item.get("shading", (0.0, 0.0))),
+        fisheye=item.get("fisheye", False) is True,
     )

@@ -99,14 +99,18 @@ def ending_of(error: BaseException) -> Ending:
     return Ending("stopped", "Ctrl-C" if isinstance(error, KeyboardInterrupt) else "ended by a signal")
 
 
-def run_json(run: Run, ending: Ending) -> dict[str, Any]:
-    """Which artefacts with which options, what was skipped and why, and how long it took; also of a failed run."""
+def run_json(run: Run, ending: Ending, flow_run: str | None = None) -> dict[str, Any]:
+    """Which artefacts with which options, what was skipped and why, and how long it took; also of a failed run.
+
+    `flow_run` is its UUID in the workflow engine.
+    """
     events = run.journal.events
     return {
         "sequence": run.name,
         "outcome": ending.outcome,
         "reason": ending.reason,
         "packuv": packuv.__version__,
+        "flow_run": flow_run,
         "command": shlex.join(sys.argv),
         "started": run.started.isoformat(timespec="seconds"),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),

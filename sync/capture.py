@@ -508,13 +508,19 @@ def _find_calibration(folder: Path, source: str | None) -> Path | None:
     if len(found) > 1:
         names = [str(path.relative_to(folder)) for path in found]
         raise ValueError(f"{folder} has several calibrations; choose one in capture.toml: calibration = one of {names}")
-    return found[0] if found else None
+    if found:
+        return found[0]
+    inside = folder / "calibration"
+    held = inside.is_dir() and any(path.is_file() and not path.name.startswith(".") for path in inside.rglob("*"))
+    return inside if held else None  # of a kind that `calibration` may know: files there are never passed over
 
 
 def _calibrations(inside: Path) -> list[Path]:
-    models = [inside, inside / "sparse" / "0", inside / "sparse", inside / "0"]
+    models = [inside, *(inside / name for name in ("sparse/0", "sparse", "0", "colmap", "colmap/sparse/0"))]
     found = [place for place in models if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))]
-    found += [inside / name for name in ("transforms.json", "poses_bounds.npy") if (inside / name).is_file()]
+    found += [
+        inside / name for name in ("rig.json", "transforms.json", "poses_bounds.npy") if (inside / name).is_file()
+    ]
     if all((inside / name).is_file() for name in ("intri.yml", "extri.yml")):
         found.append(inside)
     return found + (sorted(inside.glob("*.toml")) if inside.is_dir() else [])

@@ -31,8 +31,14 @@ class LensCamera:
     shading: tuple[float, float] = (0.0, 0.0)
     """k1, k2: light falls off by exp(k1 r^2 + k2 r^4), of mean 1 over the picture; r is the distance from the principal
     point at depth 1, r = 1 in the corner"""
+    fisheye: bool = False
+    """Whether `distortion` is k1 k2 k3 k4 of OpenCV's fisheye model"""
 
     def __post_init__(self) -> None:
+        if self.fisheye and len(self.distortion) != 4:
+            raise ValueError(
+                f"camera {self.pinhole.name!r}: a fisheye lens has 4 coefficients, not {len(self.distortion)}"
+            )
         if len(self.distortion) not in DISTORTION_LENGTHS:
             raise ValueError(
                 f"camera {self.pinhole.name!r}: a lens has one of {DISTORTION_LENGTHS} coefficients, "
@@ -50,7 +56,7 @@ class LensCamera:
         floats = {key: float(getattr(self.pinhole, key)) for key in ("fx", "fy", "cx", "cy")}
         lens = {"distortion": [float(k) for k in self.distortion], "gains": [float(gain) for gain in self.gains]}
         lens["shading"] = [float(k) for k in self.shading]
-        return {**self.pinhole.to_json(), **floats, **lens}
+        return {**self.pinhole.to_json(), **floats, **lens, **({"fisheye": True} if self.fisheye else {})}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> LensCamera:
@@ -59,17 +65,25 @@ class LensCamera:
         red, green, blue = numbers(field(data, "gains", what), f"{what}: gains", (3,)).tolist()
         lens = items(field(data, "distortion", what), f"{what}: distortion", most=max(DISTORTION_LENGTHS))
         k1, k2 = numbers(data.get("shading", (0.0, 0.0)), f"{what}: shading", (2,)).tolist()
-        return cls(pinhole, tuple(finite(k, f"{what}: distortion") for k in lens), (red, green, blue), (k1, k2))
+        fisheye = data.get("fisheye", False) is True
+        shown = tuple(finite(k, f"{what}: distortion") for k in lens)
+        return cls(pinhole, shown, (red, green, blue), (k1, k2), fisheye)
+
+    @property
+    def straight(self) -> bool:
+        """Whether the lens shows what a pinhole would."""
+        return not self.fisheye and not any(self.distortion)
 
 
 def undistorted_camera(lens: LensCamera) -> PinholeCamera:
     """The widest pinhole camera with this centre and picture size that shows only what the lens filmed.
 
+    Of a fisheye at most what keeps half the resolution in the middle: a pinhole would spend most pixels on its border.
     Raises ValueError for coefficients that fold the picture over itself.
     """
-    if not any(lens.distortion):
+    if lens.straight:
         return lens.pinhole
-    zooms = np.geomspace(4, 1 / 4, 81)
+    zooms = np.geomspace(4, 1 / 2 if lens.fisheye else 1 / 4, 81)
     valid = [_covered(lens, zoom) for zoom in zooms]
     if not valid[0]:
         raise ValueError(
@@ -107,6 +121,9 @@ def _covered(lens: LensCamera, zoom: float) -> bool:
 
 def _filmed(lens: LensCamera, rays: np.ndarray) -> np.ndarray:
     """Pixels, float64 [n, 2], where a lens shows rays [n, 2], given at depth 1."""
+    if lens.fisheye:
+        own = np.array(lens.distortion)
+        return cv2.fisheye.distortPoints(rays[None], lens.pinhole.matrix, own)[0]  # type: ignore[no-any-return]
     points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
     pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.pinhole.matrix, np.array(lens.distortion))
     return pixels.reshape(-1, 2)
@@ -114,12 +131,13 @@ def _filmed(lens: LensCamera, rays: np.ndarray) -> np.ndarray:
 
 def undistortion_maps(lens: LensCamera, camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray] | None:
     """Fixed-point maps for cv2.remap from the filmed picture to the pinhole one; None for a pinhole lens."""
-    if not any(lens.distortion):
+    if lens.straight:
         return None
     # OpenCV puts the centre of the first pixel at 0, we put it at 0.5.
     shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     size = (camera.width, camera.height)
-    maps = cv2.initUndistortRectifyMap(
+    undistort = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+    maps = undistort(
         lens.pinhole.matrix - shift, np.array(lens.distortion), np.eye(3), camera.matrix - shift, size, cv2.CV_16SC2
     )
     return maps[0], maps[1]

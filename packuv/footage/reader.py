@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
 
 
+LONG = 1000
+"""Frames of a video from which on what its packets tell is worth a file"""
+TABLES = 1
+"""Version of these files"""
+
+
 class FrameReader:
     """Decoded frames by camera and frame number, counted from 0 in presentation order.
 

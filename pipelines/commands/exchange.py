@@ -132,6 +132,7 @@ def _decibels(values: list[float | None]) -> str:
 def export_cameras(arguments: argparse.Namespace) -> int:
     """`packuv export cameras`: the scene's cameras for another program."""
     from calibration.exporters import write_colmap, write_poses_bounds, write_transforms
+    from calibration.importers.names import natural_key
     from packuv.files import whole_folder
     from packuv.scene import open_scene
 
@@ -143,7 +144,7 @@ def export_cameras(arguments: argparse.Namespace) -> int:
             elif arguments.to == "transforms":
                 write_transforms(rig, folder / "transforms.json")
             else:
-                rig = rig.select(sorted(rig.names))
+                rig = rig.select(sorted(rig.names, key=natural_key))
                 write_poses_bounds(rig, folder / "poses_bounds.npy", _depths(scene, rig))
             names = ", ".join(sorted(path.name for path in folder.iterdir()))
     print(f"{arguments.output}: {len(rig.cameras)} cameras in {names}")

@@ -298,7 +298,7 @@ def scene_figures(scene: Scene, *, verified: bool | None = None, problem: str = 
     index = scene.index
     sizes: list[int] = []
     for number, segment in enumerate(index.segments):
-        packets = iter(index.tracks[-1].sizes[segment.first_packet :])
+        packets = iter(index.tracks[-1].sizes[segment.first_packet : segment.first_packet + segment.frames])
         sizes.append(index.tracks[0].sizes[number])
         sizes += [0 if prediction == REPEAT else next(packets) for prediction in segment.predictions]
     return SceneFigures(

@@ -13,11 +13,12 @@ import numpy as np
 from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
 from calibration.colour import BalanceOptions, ColourReport, balance, with_colours
 from calibration.held_out import balance_held_out
-from calibration.importers import load_rig
-from calibration.judge import SharedJudgement, judge, judge_shared
+from calibration.importers import find_calibration, load_rig
+from calibration.judge import Judgement, SharedJudgement, judge, judge_shared
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
+from calibration.turned import fitted
 from packuv.files import save_json
 from sync.align import FrameGroups
 from sync.capture import Capture, find_capture
@@ -65,7 +66,7 @@ class PointOptions:
 class ImportRig(Stage):
     """Import the calibration of the capture and judge it by the pictures: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 3
+    name, version = "rig", 4
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -78,21 +79,24 @@ class ImportRig(Stage):
         source = capture.calibration
         if source is None or _files(source).keys() != self.files.sha256.keys():
             raise FileNotFoundError(f"the calibration of {capture.folder} is another one than when the run began")
-        sizes = {name: (v["width"], v["height"]) for name, v in read_videos(work.path(self.take.groups)).items()}
+        pictures = footage.filmed(self.first)
+        sizes = _sizes(footage, pictures, read_videos(work.path(self.take.groups)))
         kind, place = _kind(source), _place(capture)
         # No path of this machine goes into an artefact: the same capture elsewhere gives the same bytes.
-        rig = replace(load_rig(source, self.take.cameras), source=f"{kind} in {place}").resized(sizes)
+        given = replace(load_rig(source, self.take.cameras, sizes), source=f"{kind} in {place}")
+        rig, turned = fitted(given, sizes)
         work.progress(0, 1, "comparing the calibration with the pictures")
-        judgement = judge(rig, footage.filmed(self.first), options=self.options.judge)
+        judgement = judge(rig, pictures, turned=turned, options=self.options.judge)
         if judgement.matches.verdict is Verdict.REJECTED and not self.options.trust:
             raise ValueError(
                 f"{source} does not agree with the pictures: {judgement.matches.reason}; correct it, write "
                 'calibration = "solve" into capture.toml to have it solved, or use it as it is with '
                 "--set rig.trust=true"
             )
-        _save_rig(judgement.rig, self.options, judgement.to_json(), work.out)
-        given, verdict = f"{place} holds {kind}", judgement.matches.reason
-        return {"source": "import", "given": given, "reading": judgement.reading.value, "verdict": verdict}
+        odd = {**_turned(judgement), **_strays(capture, source), **judgement.doubts}
+        _save_rig(judgement.rig, self.options, judgement.to_json(), work.out, odd=odd)
+        held, verdict = f"{place} holds {kind}", judgement.matches.reason
+        return {"source": "import", "given": held, "reading": judgement.reading.value, "verdict": verdict}
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         yield "COLMAP", notes["given"]
@@ -115,7 +119,7 @@ class BorrowRig(Stage):
 
     def build(self, work: Work) -> Notes:
         footage, options = Footage(self.take, work.site), self.options
-        sizes = {name: (v["width"], v["height"]) for name, v in read_videos(work.path(self.take.groups)).items()}
+        sizes = _sizes(footage, footage.filmed(self.first), read_videos(work.path(self.take.groups)))
         lent = Rig.load(_lent(store_of(work.site.store, self.lender), self.rig)).select(self.take.cameras)
         rig = replace(lent, source=f"rig of {self.lender}: {lent.source}").resized(sizes)
         work.progress(0, 1, f"comparing the rig of {self.lender} with the pictures")
@@ -187,6 +191,7 @@ def find_rig(
     if source is None:
         # Trust is of given rigs: who trusts a lent one must not have it solved again.
         return SolveRig(take=take, first=plan.first, options=replace(options, trust=False))
+    find_calibration(source)  # a folder without a calibration is a mistake, which no solution may hide
     files = workshop.files(_files(source), "reading calibration")
     return ImportRig(take=take, first=plan.first, files=files, options=options)
 
@@ -397,6 +402,36 @@ def _place(capture: Capture) -> str:
 
 def _kind(source: Path) -> str:
     """What a calibration is, for people."""
-    if source.is_dir():
-        return "a COLMAP model" if any(source.glob("cameras.*")) else "a calibration"
-    return source.name
+    return find_calibration(source).format.KIND if source.is_dir() else source.name
+
+
+def _sizes(
+    footage: Footage, pictures: Mapping[str, np.ndarray], videos: Mapping[str, Mapping[str, Any]]
+) -> dict[str, tuple[int, int]]:
+    """Widths and heights of all cameras' pictures as they are shown: a video may be stored lying on its side."""
+    sizes = {name: (videos[name]["width"], videos[name]["height"]) for name in footage.take.cameras}
+    late = {name: numbers[numbers >= 0] for name, numbers in footage.load_frames().items() if name not in pictures}
+    reader = footage.open_reader()
+    shown = {**pictures, **{name: reader.read(name, int(own[0])) for name, own in late.items() if len(own)}}
+    return {**sizes, **{name: (picture.shape[1], picture.shape[0]) for name, picture in shown.items()}}
+
+
+def _turned(judgement: Judgement) -> dict[str, str]:
+    """What to say of cameras whose pictures stand otherwise than when they were calibrated."""
+    sure = judgement.matches.verdict is Verdict.ACCEPTED
+    told = "which the pictures confirm" if sure else "which way, the pictures do not tell"
+    return {
+        name: f"was calibrated with its picture turned by {90 * quarters} degrees against the video, {told}"
+        for name, quarters in judgement.turned.items()
+    }
+
+
+def _strays(capture: Capture, source: Path) -> dict[str, str]:
+    """Files of calibration/ of which nothing is read, where nobody chose among them."""
+    folder = capture.folder / "calibration"
+    if capture.settings.calibration is not None or not source.is_relative_to(folder):
+        return {}
+    found = find_calibration(source)
+    read = found.file.relative_to(folder)
+    strays = (path.relative_to(capture.folder) for path in found.strays(folder))
+    return {str(path): f"is not read, but {read} is" for path in strays}

@@ -64,7 +64,7 @@ class Evaluate(Stage):
         views, scene = Footage(self.take, work.site).open_views(), work.path(self.scene) / SCENE
         lpips = Lpips(Path(self.weights)) if self.backbone else None
         with open_scene(scene) as opened:
-            scores = score(opened, views, work.progress, lpips=lpips, workers=work.site.threads)
+            scores = score(opened, views, work.progress, lpips=lpips, workers=work.site.threads, scratch=work.scratch)
             write_table(work.out / TABLE, scores)
             write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
             borders = segment_starts(opened)

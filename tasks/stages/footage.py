@@ -35,6 +35,8 @@ RIG = "rig.json"
 """Name of the rig's file in artefacts"""
 LIGHT = "light.npz"
 """Name of the file of light and exposures over time in artefacts"""
+PACKETS = ".packets"
+"""Folder in the store for what the packets of long videos tell"""
 LIGHT_FACTS = "light.json"
 """Name of the file beside it, in words and figures"""
 DAMAGED = "damaged"
@@ -134,6 +136,7 @@ class Footage:
             light=light.of(names, len(frames)) if light else None,
             budget=Budget(self.site.memory_bytes),
             spill=spill,
+            reader=self._reader({name: videos[name] for name in names}),
         )
 
     def load_light(self) -> Light | None:
@@ -172,13 +175,16 @@ class Footage:
     def open_reader(self) -> FrameReader:
         """Pictures as filmed, by camera and number of the frame."""
         videos = find_capture(self.site.capture).videos
-        return FrameReader({name: videos[name] for name in self.take.cameras}, transfer=self.take.pictures.transfer)
+        return self._reader({name: videos[name] for name in self.take.cameras})
+
+    def _reader(self, videos: Mapping[str, Path]) -> FrameReader:
+        return FrameReader(videos, transfer=self.take.pictures.transfer, kept=self.site.store / PACKETS)
 
     def open_watching_reader(self, log: DamageLog) -> WatchingReader:
         """The same pictures, damaged ones noted in the log."""
         videos = find_capture(self.site.capture).videos
         own = {name: videos[name] for name in self.take.cameras}
-        return WatchingReader(own, log, transfer=self.take.pictures.transfer)
+        return WatchingReader(own, log, transfer=self.take.pictures.transfer, kept=self.site.store / PACKETS)
 
     def load_frames(self) -> dict[str, np.ndarray]:
         """By camera the number of its frame at each instant of the take, int [T], -1 where it has none."""
@@ -218,4 +224,4 @@ def lens_camera(camera: Camera) -> LensCamera:
     pinhole = PinholeCamera(
         camera.name, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.camera_from_world
     )
-    return LensCamera(pinhole, camera.distortion, camera.gains, camera.shading)
+    return LensCamera(pinhole, camera.distortion, camera.gains, camera.shading, camera.fisheye)

@@ -42,6 +42,7 @@ class MeasureLight(Stage):
             self.fitted,
             self.options,
             workers=work.site.threads,
+            kept=work.scratch,
             progress=work.progress,
         )
         light.save(work.out / LIGHT)

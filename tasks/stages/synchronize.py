@@ -25,6 +25,7 @@ class Synchronize(Stage):
     """Match the frames of all cameras: sync.json, groups.arrow, videos.json and the AVL index of each camera."""
 
     name, version = "sync", 4
+    small = True
     videos: Files
     timecodes: Files
     fps: Fraction | None

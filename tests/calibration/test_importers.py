@@ -17,7 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from calibration.exporters import write_colmap, write_poses_bounds, write_transforms
-from calibration.importers import load_rig
+from calibration.importers import find_calibration, load_rig
+from calibration.importers.names import natural_key
 from calibration.rig import Camera, Rig
 from tests.support.calibration_scene import arc, look_at, ring
 from tests.support.needs import need_data
@@ -238,8 +239,12 @@ def test_colmap_without_blank_lines_is_refused_instead_of_losing_every_second_ca
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE is not supported"),
-        ({"k4": 0.1}, "not supported"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR is not supported"),
+        ({"k4": 0.1}, "OPENCV with k4 is not supported"),
+        ({"k1": "a"}, r"transforms\.json: images/cam01\.png: k1 must be a number, but is 'a'"),
+        ({"w": 10**400}, "w must be a finite number that float64 holds"),
+        ({"fl_x": float("nan")}, "fl_x must be a finite number"),
+        ({"h": 360.5}, "h must be a whole number, but is 360.5"),
         ({"fl_x": None, "w": 5}, "float"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "must hold a rotation"),
         ({"transform_matrix": [[1]]}, r"must be \[4, 4\] or \[3, 4\], not \(1, 1\)"),
@@ -260,7 +265,7 @@ def test_unusable_transforms_are_refused(tmp_path, frame, message):
 
 def test_unsupported_lenses_say_what_to_do(tmp_path):
     write_colmap(ring(1), tmp_path)
-    (tmp_path / "cameras.txt").write_text("1 OPENCV_FISHEYE 640 360 500 500 320 180 0 0 0 0\n")
+    (tmp_path / "cameras.txt").write_text("1 FOV 640 360 500 500 320 180 0.1\n")
     with pytest.raises(ValueError, match="undistort the pictures"):
         load_rig(tmp_path)
     with pytest.raises(ValueError, match="no rational lens model"):
@@ -282,7 +287,7 @@ def test_a_cut_binary_model_is_reported_never_half_read(tmp_path_factory, data):
     name = data.draw(st.sampled_from(["cameras.bin", "images.bin"]))
     whole = (folder / name).read_bytes()
     (folder / name).write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
-    with pytest.raises(ValueError, match=r"cameras\.bin"):
+    with pytest.raises(ValueError, match=rf"{name[:-4]}\.bin"):
         load_rig(folder)
 
 
@@ -295,6 +300,110 @@ def test_any_text_is_a_model_or_a_clear_error(tmp_path_factory, text):
         load_rig(folder)
 
 
+@pytest.mark.parametrize(
+    ("file", "line", "message"),
+    [
+        ("images.txt", "1 0 0 0 0 0 0 1 1 a.png", r"images\.txt: image 'a.png': a rotation's quaternion must have the"),
+        ("images.txt", "1 nan 0 0 0 0 0 1 1 a.png", r"images\.txt: line 1: a pose's number must be a finite number"),
+        ("images.txt", "1 1e999 0 0 0 0 0 1 1 a.png", r"images\.txt: line 1: a pose's number must be a finite number"),
+        ("images.txt", "1 1e300 1e300 0 0 0 0 1 1 a.png", r"images\.txt: image 'a.png': .* length 1, but is"),
+        ("images.txt", "1 1 0 0 0 0 0 1 7 a.png", r"images\.txt: images must have cameras of cameras.txt, .* not 7"),
+        ("images.txt", "1 1 0 0 0 0 x 1 1 a.png", r"images\.txt: line 1: a pose's number must be a number, but is 'x'"),
+        ("images.txt", "1 1 0 0 0", r"images\.txt: line 1 must give IMAGE_ID, QW"),
+        ("cameras.txt", "1 PINHOLE 640 360 500 500 320 1e400", r"cameras\.txt: line 1: a parameter must be a finite"),
+        (
+            "cameras.txt",
+            "1 PINHOLE 64O 360 500 500 320 180",
+            r"cameras\.txt: line 1: the width must be a number, but is",
+        ),
+        (
+            "cameras.txt",
+            f"1 PINHOLE {'9' * 400} 360 500 500 320 180",
+            r"cameras\.txt: line 1: the width must be a finite",
+        ),
+        ("cameras.txt", "1 PINHOLE", r"cameras\.txt: line 1 must give CAMERA_ID, MODEL"),
+    ],
+)
+def test_a_fault_is_said_of_its_file(tmp_path, file, line, message):
+    write_colmap(ring(1), tmp_path)
+    (tmp_path / file).write_text(line + "\n")
+    with pytest.raises(ValueError, match=message) as raised:
+        load_rig(tmp_path)
+    assert ("cameras.txt: " in str(raised.value)) is (file == "cameras.txt")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_text_may_be_unicode_of_any_kind(tmp_path, encoding):
+    (tmp_path / "model").mkdir()
+    write_colmap(ring(2), tmp_path / "model")
+    write_transforms(ring(2), tmp_path / "transforms.json")
+    ring(2).save(tmp_path / "rig.json")
+    write_easymocap(tmp_path, ring(2))
+    names = ("model/cameras.txt", "model/images.txt", "transforms.json", "rig.json", "intri.yml", "extri.yml")
+    for path in (tmp_path / name for name in names):
+        path.write_text(path.read_text().replace("\n", "\r\n"), encoding=encoding, newline="")
+        if not path.name.startswith(("cameras", "intri")):
+            assert load_rig(path).names == ("cam00", "cam01")
+
+
+def test_what_is_no_text_says_so(tmp_path):
+    (tmp_path / "transforms.json").write_bytes(b'{"frames": "\xe9"}')
+    with pytest.raises(ValueError, match=r"json must be text in UTF-8 or UTF-16, but byte 12 fits neither"):
+        load_rig(tmp_path)
+    (tmp_path / "transforms.json").write_text('{"frames": [\n}')
+    with pytest.raises(ValueError, match=r"transforms\.json is no JSON: .*, line 2"):
+        load_rig(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("picture", "video"),
+    [
+        ("caf\u00e9.png", "cafe\u0301"),  # composed, and taken apart as macOS does
+        ("cafe\u0301.png", "caf\u00e9"),
+        ("CAM1.PNG", "cam1"),
+        ("cam1.mp4.jpg", "cam1"),
+        ("cam1_000001.jpg", "cam1"),
+        ("cam1-17.jpg", "cam1"),
+        ("cam1/frame_000017.jpg", "cam1"),
+        ("images\\cam1\\0.jpg", "cam1"),
+    ],
+)
+def test_names_that_mean_one_camera(tmp_path, picture, video):
+    other = picture.replace("cam1", "cam2").replace("CAM1", "CAM2").replace("caf", "caff")
+    write_images(tmp_path, {picture: A, other: B})
+    second = video.replace("cam1", "cam2").replace("caf", "caff")
+    rig = load_rig(tmp_path, [second, video])
+    assert rig.names == (second, video)
+    assert np.allclose(rig[video].camera_from_world, A, atol=1e-9)
+
+
+def test_cameras_that_differ_in_case_alone_are_told_apart(tmp_path):
+    write_images(tmp_path, {"cam.png": A, "CAM.png": B})
+    assert load_rig(tmp_path, ["CAM", "cam"]).names == ("CAM", "cam")
+    with pytest.raises(ValueError, match="2 pictures of camera 'Cam' must share one pose and lens"):
+        load_rig(tmp_path, ["Cam"])
+
+
+def test_other_files_are_named(tmp_path):
+    write_colmap(ring(2), tmp_path / "sparse/0")
+    write_transforms(ring(2), tmp_path / "transforms.json")
+    for name in ("README.md", ".DS_Store", "sparse/0/points3D.bin", "sparse/1/cameras.bin", "old.npy"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    found = find_calibration(tmp_path)
+    assert found.file == tmp_path / "sparse/0/cameras.txt"
+    strays = [str(path.relative_to(tmp_path)) for path in found.strays(tmp_path)]
+    assert strays == ["old.npy", "sparse/1/cameras.bin", "transforms.json"]
+
+
+@pytest.mark.parametrize("name", ["cameras.json", "dataset.JSON"])
+def test_a_file_of_another_name_is_known_by_what_it_says(tmp_path, name):
+    write_transforms(ring(2), tmp_path / name)
+    assert load_rig(tmp_path).names == ("cam00", "cam01")
+    ring(3).save(tmp_path / name)
+    assert load_rig(tmp_path / name).names == ("cam00", "cam01", "cam02")
+
+
 # LLFF and N3DV
 
 
@@ -303,7 +412,7 @@ def llff_rigs(draw):
     """What the format can hold: one focal length, a centred principal point, names in order, no lens."""
     rig = draw(rigs(coefficients=(0,)))
     plain = [replace(c, fy=c.fx, cx=c.width / 2, cy=c.height / 2) for c in rig.cameras]
-    return Rig(tuple(sorted(plain, key=lambda camera: camera.name)), "drawn")
+    return Rig(tuple(sorted(plain, key=lambda camera: natural_key(camera.name))), "drawn")
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow], deadline=None)

@@ -282,7 +282,9 @@ def test_timecodes_for_some_cameras_only_are_refused(tmp_path: Path) -> None:
         (("calibration/poses_bounds.npy",), "calibration/poses_bounds.npy"),
         (("calibration/intri.yml", "calibration/extri.yml"), "calibration"),
         (("calibration/camera_array.toml",), "calibration/camera_array.toml"),
-        (("calibration/intri.yml",), None),
+        (("calibration/intri.yml",), "calibration"),
+        (("calibration/params.txt", "calibration/notes.md"), "calibration"),
+        (("calibration/.DS_Store",), None),
     ],
 )
 def test_calibrations_are_found(tmp_path: Path, files: tuple[str, ...], found: str | None) -> None:
