@@ -49,6 +49,7 @@ class ExactDecoder:
         self._develop: Develop = converted if coding.plain(said) else Developer(coding, coding.curve(said)).picture
         self._packets, self._damage = packets, damage
         self._jpeg = careful and self._stream.codec_context.name == "mjpeg"
+        self._nal_bytes = _nal_bytes(self._stream.codec_context)
         self._frames: Iterator[av.VideoFrame] = iter(())
         self._turn: Turn | None = None
         self._at: int | None = None
@@ -123,7 +124,7 @@ class ExactDecoder:
     def _decoded(self) -> Iterator[av.VideoFrame]:
         """All frames from here on; what is damaged among them is marked."""
         for packet in self._container.demux(self._stream):
-            if packet.is_disposable and packet.pts is not None:
+            if packet.pts is not None and packet.size and self._is_spare(packet):
                 self._spare.add(packet.pts)
             if self._jpeg and packet.size and jpeg_fault(memoryview(packet)):
                 self._found(packet.pts, Damage.CONCEALED)
@@ -138,6 +139,10 @@ class ExactDecoder:
                 self._spare.discard(frame.pts)
                 yield frame
 
+    def _is_spare(self, packet: av.Packet[av.VideoStream]) -> bool:
+        """Whether no other picture needs this one, as containers hardly ever say, but H.264 does."""
+        return packet.is_disposable or (self._nal_bytes > 0 and _unreferenced(memoryview(packet), self._nal_bytes))
+
     def _found(self, tick: int | None, what: Damage) -> None:
         """The decoder calls the frame of this time damaged."""
         frame = None if tick is None else self._packets.frame_at(tick)
@@ -149,8 +154,26 @@ class ExactDecoder:
             self._mark(frame, what)
 
     def _mark(self, frame: int, what: Damage) -> None:
-        if int(self._packets.ticks[frame]) not in self._spare:
+        # Of a packet that could not be decoded nothing is believed.
+        if what is Damage.LOST or int(self._packets.ticks[frame]) not in self._spare:
             for other in self._packets.after(frame).tolist():
                 self._damage.setdefault(other, Damage.FOLLOWS)
         if self._damage.get(frame) is not Damage.LOST:
             self._damage[frame] = what
+
+
+def _nal_bytes(codec: av.VideoCodecContext) -> int:
+    """Bytes of the lengths before units of H.264 in MP4 and Matroska; 0 for other streams."""
+    said = codec.extradata or b""
+    return (said[4] & 3) + 1 if codec.name == "h264" and len(said) > 4 and said[0] == 1 else 0
+
+
+def _unreferenced(packet: memoryview, nal_bytes: int) -> bool:
+    """Whether the picture of an H.264 packet is one that no other refers to (nal_ref_idc 0 of its first slice)."""
+    at = 0
+    while at + nal_bytes < len(packet):
+        header = packet[at + nal_bytes]
+        if header & 31 in (1, 5):
+            return header >> 5 & 3 == 0
+        at += nal_bytes + int.from_bytes(packet[at : at + nal_bytes])
+    return False

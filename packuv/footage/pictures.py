@@ -132,4 +132,4 @@ def _is_frame(name: str) -> bool:
 
 def _natural(stem: str) -> list[tuple[int, int, str]]:
     parts = re.findall(r"\d+|\D+", stem)
-    return [(0, int(part), part) if part[0].isdecimal() else (1, 0, part) for part in parts]
+    return [(0, int(part), part) if part[0].isdecimal() else (1, 0, part.casefold()) for part in parts]

@@ -22,6 +22,7 @@ from packuv.metrics import trend
 from packuv.scene import Scene
 from packuv.scene.stream import REPEAT
 from sync.align import SyncReport
+from sync.natural import natural_key
 
 MAX_PSNR_DB = 99.0
 """Equal pictures have an infinite ratio, which neither JSON nor a mean can hold; they count as this"""
@@ -326,9 +327,9 @@ def frames_to_picture(scores: Sequence[FrameScore]) -> tuple[tuple[str, int, str
 
 
 def by_camera(scores: Sequence[FrameScore]) -> dict[str, list[FrameScore]]:
-    """Scores of each camera, in order of frames; cameras by name."""
+    """Scores of each camera, in order of frames; cameras in natural order."""
     cameras: dict[str, list[FrameScore]] = {}
-    for score in sorted(scores, key=lambda item: (item.camera, item.frame)):
+    for score in sorted(scores, key=lambda item: (natural_key(item.camera), item.camera, item.frame)):
         cameras.setdefault(score.camera, []).append(score)
     return cameras
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -48,10 +48,6 @@ class Synchronize(Stage):
         facts = {"instants": len(groups), "cameras": len(groups.cameras), "reference": groups.reference}
         notes = [*found.notes, *picture_notes(found, infos), *(note for info in infos.values() for note in info.notes)]
         return {**facts, FOOTAGE: notes} if notes else facts
-
-    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
-        for note in notes.get(FOOTAGE, ()):
-            yield "footage", note
 
     def _check(self, found: Capture) -> None:
         """A file that comes and goes while the job runs is seen by nobody else."""

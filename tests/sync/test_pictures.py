@@ -73,6 +73,7 @@ def test_frames_are_in_order_of_their_numbers_whatever_stands_around_them(
         (("cam.mp4_9.jpg", "cam.mp4_10.jpg"), [9, 10]),
         (("2026-11-28_7.png", "2026-11-29_8.png"), [7, 8]),
         (("7.png",), [7]),
+        (("IMG_10.png", "img_9.PNG"), [9, 10]),
     ],
 )
 def test_published_names(tmp_path: Path, names: tuple[str, ...], numbers: list[int]) -> None:
@@ -160,7 +161,7 @@ def test_what_is_passed_over_is_said(tmp_path: Path) -> None:
     )
     fill(videos / "old", "cam3.mp4")
     capture = find_capture(tmp_path)
-    assert capture.cameras == ("CAM2", "cam1")
+    assert capture.cameras == ("cam1", "CAM2")
     old, loose, others = capture.notes
     assert "videos/old/ is passed over: it holds no numbered pictures" in old
     assert "1 pictures that belong to no video (cam_000001.jpg)" in loose
