@@ -21,8 +21,8 @@ from sync.natural import natural_key
 from sync.timecode import frames_to_ns
 
 PICTURE_SUFFIXES = frozenset({".exr", ".jpeg", ".jpg", ".png"})
-CODECS = {".exr": "exr", ".png": "png"}
-"""FFmpeg's decoder by suffix; of all others that of JPEG"""
+CODECS = {b"v/1\x01": "exr", b"\x89PNG": "png"}
+"""FFmpeg's decoder by the first bytes of a file, whatever it is called; of all others that of JPEG"""
 USUAL_RATE = Fraction(30)
 """Frames per second of pictures, where neither capture.toml nor a video tells"""
 LARGEST_SHARE_LOST = 10
@@ -135,11 +135,12 @@ def list_pictures(folder: Path) -> Pictures:
 
 def decode_picture(path: Path) -> av.VideoFrame:
     """A picture as its file stores it; raises ValueError for one that cannot be decoded."""
-    codec = av.CodecContext.create(CODECS.get(path.suffix.lower(), "mjpeg"), "r")
+    content = path.read_bytes()
+    codec = av.CodecContext.create(CODECS.get(content[:4], "mjpeg"), "r")
     assert isinstance(codec, av.VideoCodecContext)
     codec.thread_count = 1
     try:
-        packet = av.Packet(path.read_bytes())
+        packet = av.Packet(content)
         frames = codec.decode(packet) or codec.decode(None)
     except av.FFmpegError as error:
         raise ValueError(f"{path} is no picture that FFmpeg can read: {error.strerror}; copy it again") from None
