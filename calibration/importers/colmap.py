@@ -57,7 +57,10 @@ def read(file: Path, videos: Videos) -> Reading:
     with about(cameras):
         lenses = _binary_lenses(cameras) if suffix == ".bin" else _text_lenses(cameras)
     with about(images):
-        return Reading(_binary_views(images, lenses) if suffix == ".bin" else _text_views(images, lenses))
+        views = _binary_views(images, lenses) if suffix == ".bin" else _text_views(images, lenses)
+        if not views:
+            raise ValueError("it lists no images, so nothing has a pose; solve again")
+        return Reading(views)
 
 
 def _text_lenses(path: Path) -> dict[int, Camera]:

@@ -11,13 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.accept import check_rig
+from calibration.accept import Verdict, check_rig
 from calibration.exporters import write_colmap, write_poses_bounds, write_transforms
 from calibration.importers import load_rig
+from calibration.judge import judge
 from calibration.rig import Camera, Rig, distort_fisheye, undistort_fisheye
+from calibration.triangulate import triangulate
 from packuv.footage.lens import LensCamera, undistorted_camera, undistortion_maps
 from tasks.stages.footage import lens_camera
-from tests.support.calibration_scene import ring
+from tests.support.calibration_scene import arc, render, ring
 
 LENS = (0.03, 0.01, -0.002, 0.001)
 # Bisection ends at the last bits of an angle near 1.5, whose tangent is 29 at most.
@@ -140,3 +142,20 @@ def test_a_fisheye_needs_four_coefficients():
         Camera("a", 64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4), (0.1,) * 5, fisheye=True)
     with pytest.raises(ValueError, match="fisheye lens has 4 coefficients, not 0"):
         LensCamera(lens_camera(ring(1).cameras[0]).pinhole, fisheye=True)
+
+
+@pytest.mark.slow
+def test_pictures_of_fisheyes_agree_with_their_poses_and_not_with_a_pinholes():
+    cameras = [replace(c, fx=170.0, fy=171.0, distortion=(0.05, -0.02, 0.0, 0.0), fisheye=True) for c in arc(5).cameras]
+    rig = Rig(tuple(cameras), "fisheyes")
+    pictures = {camera.name: render(camera) for camera in cameras}
+    judgement = judge(rig, pictures)
+    assert judgement.matches.verdict is Verdict.ACCEPTED
+    assert judgement.matches.pair_median_px is not None
+    assert judgement.matches.pair_median_px < 0.5  # a right calibration of sharp pictures stays below 1
+    straight = Rig(tuple(replace(c, distortion=(), fisheye=False) for c in cameras), "taken for pinholes")
+    wrong = judge(straight, pictures).matches
+    assert wrong.pair_median_px is None or wrong.pair_median_px > 2 * judgement.matches.pair_median_px
+    points = triangulate(rig, [pictures])
+    assert len(points.xyz) > 50
+    assert np.median(points.error_px) < 0.5

@@ -309,6 +309,7 @@ def test_any_text_is_a_model_or_a_clear_error(tmp_path_factory, text):
         ("images.txt", "1 1e300 1e300 0 0 0 0 1 1 a.png", r"images\.txt: image 'a.png': .* length 1, but is"),
         ("images.txt", "1 1 0 0 0 0 0 1 7 a.png", r"images\.txt: images must have cameras of cameras.txt, .* not 7"),
         ("images.txt", "1 1 0 0 0 0 x 1 1 a.png", r"images\.txt: line 1: a pose's number must be a number, but is 'x'"),
+        ("images.txt", "# no images", r"images\.txt: it lists no images"),
         ("images.txt", "1 1 0 0 0", r"images\.txt: line 1 must give IMAGE_ID, QW"),
         ("cameras.txt", "1 PINHOLE 640 360 500 500 320 1e400", r"cameras\.txt: line 1: a parameter must be a finite"),
         (
