@@ -271,7 +271,7 @@ def matches_report(
 ) -> MatchesReport:
     """Judge poses and lenses by verified matches (`triangulate.verified_matches`)."""
     telling = [pair for pair in _merged(matches) if len(pair.first_pixels) >= options.min_matches]
-    errors = [_pair_errors_px(rig, pair) for pair in telling]
+    errors = [pair_errors_px(rig, pair) for pair in telling]
     shares = [float((error <= options.max_error_px).mean()) for error in errors]
     bad = {pair.key: share for pair, share in zip(telling, shares, strict=True) if share < options.bad_share}
     every = np.concatenate([*errors, np.zeros(0)])
@@ -342,7 +342,7 @@ def _explained(entries: Sequence[tuple[PairMatches, float]]) -> float:
     return sum(share * len(pair.first_pixels) for pair, share in entries) / total
 
 
-def _pair_errors_px(rig: Rig, pair: PairMatches) -> np.ndarray:
+def pair_errors_px(rig: Rig, pair: PairMatches) -> np.ndarray:
     """Sampson distance of each match, infinite where its point lies behind a camera: float64 [K]."""
     first, second = rig[pair.first], rig[pair.second]
     a, b = first.plane_from_pixels(pair.first_pixels), second.plane_from_pixels(pair.second_pixels)

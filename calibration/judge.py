@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from calibration.accept import MatchesReport, PairMatches, Verdict, matches_report
+from calibration.doubt import doubts
 from calibration.features import Features, pairs_by_look
 from calibration.moved import Standing, find_moved
 from calibration.rig import Rig
@@ -47,11 +48,14 @@ class Judgement:
     """Of the calibration as the file gives it; None when its cameras see no common volume"""
     turned: Mapping[str, int] = field(default_factory=dict)
     """By how many quarters clockwise the pictures of cameras stand otherwise than when they were calibrated"""
+    doubts: Mapping[str, str] = field(default_factory=dict)
+    """What speaks against single cameras, or all of them (`calibration.doubt`)"""
 
     def to_json(self) -> dict[str, Any]:
         given = self.given.to_json() if self.given else None
         turned = {"turned": dict(self.turned)} if self.turned else {}
-        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned}
+        doubts = {"doubts": dict(self.doubts)} if self.doubts else {}
+        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned, **doubts}
 
 
 def judge(
@@ -80,23 +84,20 @@ def judge(
 
 
 def _judge(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> Judgement:
-    given = _report(rig, features, options)
-    fits = given is not None and given.verdict is not Verdict.REJECTED
-    if given is not None and fits and not given.bad_cameras:
-        return Judgement(rig, Reading.AS_GIVEN, given, given)
+    given, near = _report(rig, features, options)
+    if given is not None and given.verdict is not Verdict.REJECTED:
+        turned = _head_up(rig, given.bad_cameras, features, near, given, options) if given.bad_cameras else None
+        found = doubts(rig, near, given, judge=options.judge)
+        return turned or Judgement(rig, Reading.AS_GIVEN, given, given, doubts=found)
     pairs = pairs_by_look(features, ratio=options.ratio)
     evidence = verified_matches(rig, features, pairs, ratio=options.ratio)
-    if given is not None and fits:
-        return _head_up(rig, given.bad_cameras, features, evidence, given, options) or Judgement(
-            rig, Reading.AS_GIVEN, given, given
-        )
     for reading in _by_promise(rig, evidence, options):
         other = reread(rig, reading)
-        report = _report(other, features, options)
+        report, seen = _report(other, features, options)
         if report is not None and report.verdict is Verdict.ACCEPTED:
-            return Judgement(other, reading, report, given)
-    if judgement := _head_up(rig, rig.names, features, evidence, given, options):
-        return judgement
+            return Judgement(other, reading, report, given, doubts=doubts(other, seen, report, judge=options.judge))
+    if turned := _head_up(rig, rig.names, features, evidence, given, options):
+        return turned
     if given is None:
         raise ValueError(
             f"{rig.source}: the cameras see no common volume, and the pictures agree with no other reading"
@@ -115,10 +116,11 @@ def _head_up(
     """The judgement with cameras turned over that film upside down; None where that does not clear up all suspects."""
     turns = {name: turn for name, turn in upright(rig, suspects, evidence, options=options.judge).items() if turn}
     other = with_turns(rig, turns)
-    report = _report(other, features, options) if turns else None
+    report, seen = _report(other, features, options) if turns else (None, [])
     if report is None or report.verdict is not Verdict.ACCEPTED or set(report.bad_cameras) & set(turns):
         return None
-    return Judgement(other, Reading.AS_GIVEN, report, given, turns)
+    found = doubts(other, seen, report, judge=options.judge)
+    return Judgement(other, Reading.AS_GIVEN, report, given, turns, doubts=found)
 
 
 @dataclass(frozen=True)
@@ -183,14 +185,17 @@ def _reread_pose(pose: np.ndarray, reading: Reading) -> np.ndarray:
     return poses[reading]
 
 
-def _report(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> MatchesReport | None:
-    """Matches of neighbouring cameras under the poses; None when the cameras see no common volume."""
+def _report(
+    rig: Rig, features: Mapping[str, Features], options: TriangulateOptions
+) -> tuple[MatchesReport | None, list[PairMatches]]:
+    """Matches of neighbouring cameras, and what the poses make of them; None when they see no common volume."""
     try:
         pairs = choose_pairs(rig, neighbours=options.neighbours)
     except ValueError:
-        return None
+        return None, []
     near = [(first, second) for first, second in pairs if first in features and second in features]
-    return matches_report(rig, verified_matches(rig, features, near, ratio=options.ratio), options=options.judge)
+    evidence = verified_matches(rig, features, near, ratio=options.ratio)
+    return matches_report(rig, evidence, options=options.judge), evidence
 
 
 def _by_promise(rig: Rig, evidence: Sequence[PairMatches], options: TriangulateOptions) -> list[Reading]:

@@ -5,9 +5,11 @@ still areas apart, motion, flicker, LPIPS. docs/scores.md defines each.
 from __future__ import annotations
 
 import math
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -18,8 +20,9 @@ import pyarrow as pa
 
 from packuv.camera import PinholeCamera
 from packuv.colour import GAMMA, OFFSET, linear_from_srgb, lit, srgb_from_linear
-from packuv.files import save_json
+from packuv.files import save_json, save_npz, whole_file
 from packuv.footage import Views
+from packuv.footage.planes import as_planes
 from packuv.gaussians.floats import Gaussians
 from packuv.metrics import decibels, likenesses, trend
 from packuv.motion import Follower, one_opencv_thread
@@ -72,6 +75,8 @@ TRENDS = {"still_trend_db": "psnr_still_db", "never_moving_trend_db": "psnr_neve
 """What is said of their course, dB per 100 frames"""
 BLOCKS = 40
 """Across a picture, by which places are known through which nothing ever moves"""
+PART = 256
+"""Frames that are scored, written down and let go of together; what a kill costs"""
 AHEAD = 2
 """Drawn pictures that may wait for each worker"""
 
@@ -80,33 +85,157 @@ Measure = Callable[[np.ndarray, np.ndarray], float]
 
 
 def score(
-    scene: Scene, views: Views, progress: Progress, *, lpips: Measure | None = None, workers: int = 2
+    scene: Scene,
+    views: Views,
+    progress: Progress,
+    *,
+    lpips: Measure | None = None,
+    workers: int = 2,
+    scratch: Path | None = None,
 ) -> list[Score]:
     """Score every frame on all cameras of the views, whose instant i is frame i of the scene.
 
     A camera without a picture at an instant is not scored there. One thread draws, `workers` others compare; the scores
-    do not depend on their number.
+    do not depend on their number. What is scored goes to the folder `scratch`, from which the same scoring goes on
+    after a kill; None: to one that goes away.
     """
-    artist, waiting, scores = Artist(scene), deque[Future[Score]](), list[Score]()
-    held_out = scene.header.held_out
-    judges = [_Judge(views, index, name in held_out, lpips) for index, name in enumerate(views.names)]
-    gaussians = None
-    with one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
-        for frame in range(len(scene)):
-            gaussians = scene.gaussians(frame, into=gaussians)
-            for index, camera in enumerate(views.cameras):
-                truth = views.filmed(index, frame)
-                if truth is None:
-                    continue
-                drawn = artist.draw(gaussians, camera)
-                shot = _Shot.of(views, index, frame, truth, drawn, scene)
-                waiting.append(judges[index].submit(pool, shot))
-                while len(waiting) > AHEAD * workers:
-                    scores.append(waiting.popleft().result())
-            progress(frame + 1, len(scene), f"{_mean([s.psnr_calibrated_db for s in scores]) or 0:.2f} dB")
-        scores += [future.result() for future in waiting]
-    never = {judge.name: judge.watch.never_moving() for judge in judges}
-    return [replace(item, psnr_never_moving_db=next(never[item.camera])) for item in scores]
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) if scratch is None else scratch
+        parts = [_Part(folder, range(len(scene))[first : first + PART]) for first in range(0, len(scene), PART)]
+        stack.enter_context(one_opencv_thread())
+        pool = stack.enter_context(ThreadPoolExecutor(workers))
+        scorer = _Scorer(scene, views, lpips, pool, AHEAD * workers)
+        for part in parts:
+            if part.there:
+                scorer.pass_over(part.frames, part.scores(), progress)
+            else:
+                part.write(scorer.scores(part.frames, progress), [judge.watch for judge in scorer.judges])
+        still = [_never_moving(parts, camera) for camera in range(len(views.names))]
+        return [item for part in parts for item in part.finished(views.names, still)]
+
+
+class _Scorer:
+    """Scores frames in order, from any one on."""
+
+    def __init__(
+        self, scene: Scene, views: Views, lpips: Measure | None, pool: ThreadPoolExecutor, most_waiting: int
+    ) -> None:
+        self._scene, self._views, self._pool, self._most_waiting = scene, views, pool, most_waiting
+        held_out = scene.header.held_out
+        self.judges = [_Judge(views, index, name in held_out, lpips) for index, name in enumerate(views.names)]
+        self._artist = Artist(scene)
+        self._gaussians, self._shown = scene.gaussians(0), 0  # what was read last
+        self._at = 0
+        self._total_db, self._count = 0.0, 0
+
+    def scores(self, frames: range, progress: Progress) -> list[Score]:
+        """Of all pictures of these frames; what moves and what flickers is told from the pictures before them."""
+        if frames.start != self._at:
+            self._look_before(frames.start)
+        waiting, scores = deque[Future[Score]](), list[Score]()
+        for frame in frames:
+            for camera in range(len(self._views.cameras)):
+                if self._views.has(camera, frame):
+                    waiting.append(self._submit(camera, frame))
+                while len(waiting) > self._most_waiting:
+                    scores.append(self._heard(waiting.popleft().result()))
+            progress(frame + 1, len(self._scene), self._note)
+        self._at = frames.stop
+        return scores + [self._heard(future.result()) for future in waiting]
+
+    def pass_over(self, frames: range, scores: Sequence[Score], progress: Progress) -> None:
+        """These frames were scored before."""
+        for item in scores:
+            self._heard(item)
+        progress(frames.stop, len(self._scene), self._note)
+
+    def _look_before(self, start: int) -> None:
+        """Look at each camera's last picture before a frame."""
+        there = self._views.frames[:start] >= 0  # [start, C]
+        cameras = np.flatnonzero(there.any(axis=0)).tolist()
+        last = {camera: int(np.flatnonzero(there[:, camera])[-1]) for camera in cameras}
+        for camera, frame in sorted(last.items(), key=lambda item: item[1]):
+            self._submit(camera, frame).result()
+        for judge in self.judges:
+            judge.watch.forget()
+
+    def _submit(self, camera: int, frame: int) -> Future[Score]:
+        if frame != self._shown:
+            self._gaussians, self._shown = self._scene.gaussians(frame, into=self._gaussians), frame
+        drawn = self._artist.draw(self._gaussians, self._views.cameras[camera])
+        return self.judges[camera].submit(self._pool, _Shot.of(self._views, camera, frame, drawn, self._scene))
+
+    def _heard(self, item: Score) -> Score:
+        if item.psnr_calibrated_db is not None:
+            self._total_db, self._count = self._total_db + item.psnr_calibrated_db, self._count + 1
+        return item
+
+    @property
+    def _note(self) -> str:
+        return f"{self._total_db / max(1, self._count):.2f} dB"
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some frames on disk, with what is known when all are scored: errors by place, and where anything moved."""
+
+    folder: Path
+    frames: range
+
+    @property
+    def there(self) -> bool:
+        return self._table.exists()
+
+    @property
+    def _table(self) -> Path:
+        return self.folder / f"{self.frames.start:09d}.arrow"
+
+    @property
+    def _places(self) -> Path:
+        return self._table.with_suffix(".npz")
+
+    def write(self, scores: Sequence[Score], watches: Sequence[_Watch]) -> None:
+        """Write all that is known of these frames; the watches forget them."""
+        arrays = {}
+        for camera, watch in enumerate(watches):
+            if watch.blocks:
+                arrays[f"blocks_{camera}"] = np.stack(watch.blocks)
+            if watch.moved is not None:
+                arrays[f"moved_{camera}"] = watch.moved
+            watch.forget()
+        save_npz(self._places, arrays)
+        with whole_file(self._table) as partial:  # the last one: with it the part is there
+            write_table(partial, scores)
+
+    def scores(self) -> tuple[Score, ...]:
+        return read_table(self._table)
+
+    def moved(self, camera: int) -> np.ndarray | None:
+        """bool [rows, BLOCKS]: something moved there; None where no two pictures follow one another."""
+        with np.load(self._places) as arrays:
+            found: np.ndarray | None = arrays.get(f"moved_{camera}")
+            return found
+
+    def finished(self, names: Sequence[str], still: Sequence[np.ndarray | None]) -> Iterator[Score]:
+        """The scores, with those of the places where nothing ever moves, bool [rows, BLOCKS] by camera."""
+        with np.load(self._places) as arrays:
+            levels = {
+                name: iter(_still_levels(arrays[f"blocks_{camera}"], still[camera]))
+                for camera, name in enumerate(names)
+                if f"blocks_{camera}" in arrays
+            }
+        return (replace(item, psnr_never_moving_db=next(levels[item.camera])) for item in self.scores())
+
+
+def _never_moving(parts: Sequence[_Part], camera: int) -> np.ndarray | None:
+    """bool [rows, BLOCKS]: nothing moves there in any part; None where that is not known."""
+    known = [moved for part in parts if (moved := part.moved(camera)) is not None]
+    return ~np.logical_or.reduce(known) if known else None
+
+
+def _still_levels(blocks: Sequence[np.ndarray] | np.ndarray, still: np.ndarray | None) -> list[float | None]:
+    """PSNR of each picture in some places, dB; of mean squared errors, float32 [rows, BLOCKS] each."""
+    return [None if still is None or not still.any() else _level(block[still]) for block in blocks]
 
 
 @dataclass(frozen=True)
@@ -115,8 +244,10 @@ class _Shot:
 
     frame: int
     time_ns: int
+    pixels: np.ndarray
+    """uint8 [H, W, 3], as filmed"""
     truth: np.ndarray
-    """float32 [3, H, W], as filmed"""
+    """float32 [3, H, W], likewise"""
     seen: np.ndarray
     """float32 [3, H, W], in the scene's light of the instant"""
     shown: np.ndarray
@@ -125,11 +256,14 @@ class _Shot:
     """uint8 [H, W, 3], as the camera films it in steady light"""
 
     @classmethod
-    def of(cls, views: Views, camera: int, frame: int, truth: np.ndarray, drawn: np.ndarray, scene: Scene) -> _Shot:
+    def of(cls, views: Views, camera: int, frame: int, drawn: np.ndarray, scene: Scene) -> _Shot:
+        pixels = views.pixels(camera, frame, remember=False)  # one pass needs it once
+        assert pixels is not None, "only pictures that there are can be scored"
         shown = views.response(camera, frame).shown(drawn)
         steady = shown if views.light is None else views.response(camera, None).shown(drawn)
         seen = np.clip(lit(drawn, scene.light(frame)), 0, 1)
-        return cls(frame, int(scene.header.times_ns[frame]), truth, seen, shown, as_pixels(steady))
+        time_ns = int(scene.header.times_ns[frame])
+        return cls(frame, time_ns, pixels, as_planes(pixels), seen, shown, as_pixels(steady))
 
 
 class _Judge:
@@ -147,8 +281,7 @@ class _Judge:
         return self._last
 
     def _score(self, shot: _Shot, before: Future[Score] | None) -> Score:
-        truth, filmed = shot.truth, self._views.steady(self._camera, shot.frame)
-        assert filmed is not None, "what has a picture as filmed has one in steady light"
+        truth, filmed = shot.truth, self._views.steadied(shot.pixels, self._camera, shot.frame)
         pictures = shot.seen, shot.shown, with_own_gain(shot.shown, truth)
         raw, calibrated, own = (
             (level if math.isfinite(level) else None, alike) for level, alike in likenesses(pictures, truth)
@@ -191,10 +324,13 @@ class _Watch:
         share = float(change.moving.mean())
         return _level(squared[change.moving]), _level(squared[~change.moving]), share, change.tof_px
 
-    def never_moving(self) -> Iterator[float | None]:
+    def never_moving(self) -> list[float | None]:
         """PSNR of each picture where nothing ever moved, dB."""
-        still = np.zeros(0, bool) if self.moved is None else ~self.moved
-        return (_level(block[still]) if still.size else None for block in self.blocks)
+        return _still_levels(self.blocks, None if self.moved is None else ~self.moved)
+
+    def forget(self) -> None:
+        """Let go of all but the last picture."""
+        self.blocks, self.moved = [], None
 
 
 def _shrunk(plane: np.ndarray) -> np.ndarray:

@@ -219,6 +219,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
     _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
     _serve(command("serve", "pipelines.commands.serve:serve", "keep a dashboard, and run by form, script or schedule"))
+    _worker(command("worker", "pipelines.commands.worker:worker", "make stages here for runs with --cluster"))
     _status(command("status", "pipelines.commands.watch:status", "tell what runs, what failed and what is done"))
     _cancel(command("cancel", "pipelines.commands.watch:cancel", "end runs within seconds; they can go on later"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
@@ -261,6 +262,9 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
         help="cameras to score on, never fitted (capture.toml)",
     )
     command.add_argument("--jobs", type=_positive, default=None, metavar="N", help="segments at once (from the cores)")
+    command.add_argument(
+        "--cluster", default=None, metavar="tcp://HOST:PORT", help="Dask scheduler whose workers do the work (none)"
+    )
     _how(command, stop=stop)
     _direct(command)
 
@@ -286,6 +290,9 @@ def _batch(command: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="results go to DIR/<sequence>/ and DIR/index.html"
     )
     _which(command)
+    command.add_argument(
+        "--pool", default=None, metavar="NAME", help="hand the sequences to the workers of this Prefect work pool"
+    )
     command.add_argument("--jobs", type=_positive, default=1, metavar="N", help="segments of a sequence at once")
     command.add_argument("--dry-run", action="store_true", help="only tell what would run, and why")
     command.add_argument(
@@ -355,6 +362,15 @@ def _serve(command: argparse.ArgumentParser) -> None:
     command.add_argument("--at-once", type=_positive, default=1, metavar="N", help="runs at a time")
     command.add_argument("--host", default="127.0.0.1", help="address of the dashboard, which has no password")
     command.add_argument("--port", type=_positive, default=4200, help="of the dashboard")
+
+
+def _worker(command: argparse.ArgumentParser) -> None:
+    command.add_argument("scheduler", metavar="tcp://HOST:PORT", help="where `dask scheduler` listens")
+    command.add_argument("--cores", type=_positive, default=None, metavar="N", help="that jobs may use (all)")
+    command.add_argument("--memory-gb", type=float, default=None, metavar="GB", help="that jobs may use (what is free)")
+    command.add_argument("--gpus", type=int, default=0, metavar="N", help="jobs at a time that use a GPU")
+    command.add_argument("--host", default=None, metavar="ADDR", help="own address for the others (found out)")
+    command.add_argument("--name", default=None, help="in the cluster (its address)")
 
 
 def _status(command: argparse.ArgumentParser) -> None:

@@ -11,6 +11,7 @@ import json
 import logging
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -41,8 +42,8 @@ PROGRESS_SECONDS = 5.0
 """Least time between two posts of a stage's progress"""
 LOG_SECONDS = 60.0
 """Least time between two log lines of a stage under way"""
-MOST_POINTS = 600
-"""Of the motion curve as it is drawn"""
+LAST_PREVIEWS = 50
+"""Segments in the table of their PSNR: the table is posted anew after each"""
 CHART_STYLE = (
     "<style>svg{background:#fff;font:12px sans-serif}text{fill:#555}text.title{font-weight:600}.grid{stroke:#ddd}"
     ".axis{stroke:#555;fill:none}.line{fill:none;stroke:#1f6feb;stroke-width:1.5}.mark{stroke:#d29922}</style>"
@@ -103,7 +104,7 @@ class Dashboard:
         self._logged: dict[str, float] = {}
         self._barred: set[str] = set()
         """Stages whose progress is shown"""
-        self._previews: list[Row] = []
+        self._previews = deque[Row](maxlen=LAST_PREVIEWS)
 
     def began(self, label: str, forecast: Forecast) -> None:
         self._posted[label] = self._logged[label] = time.monotonic()
@@ -159,8 +160,7 @@ class Dashboard:
 
     def keyframes(self, folder: Path) -> None:
         curve, chosen = read_curve(folder), read_keyframes(folder)
-        step = -(-len(curve) // MOST_POINTS)
-        series = [Series("M(t)", range(0, len(curve), step), curve[::step])]
+        series = [Series("M(t)", range(len(curve)), curve)]
         drawn = line_chart(
             series, title="Motion", x_label="instant", y_label="optical flow, px", marks=chosen, from_zero=True
         )
@@ -180,19 +180,26 @@ class Dashboard:
         mean = sum(levels.values()) / len(levels)
         cells = {name: f"{level:.2f} dB" for name, level in levels.items()}
         self._previews.append({"frames": f"{first}-{last}", "mean": f"{mean:.2f} dB", **cells})
-        self._table("psnr", self._previews, "PSNR at the last frame of each segment")
+        self._table("psnr", self._previews, "PSNR at the last frame of each segment", changing=True)
         url = _data_url("image/jpeg", (folder / PICTURE).read_bytes())
-        self._image("preview", url, f"Frame {last} of {next(iter(levels))}: filmed at the left, rendered at the right")
+        what = f"Frame {last} of {next(iter(levels))}: filmed at the left, rendered at the right"
+        self._image("preview", url, what, changing=True)
 
     def _bar(self, label: str, share: float, text: str) -> None:
         self._barred.add(label)
         self._board.progress(share, f"{label}: {text}", of=label, task_run=_task_run())
 
-    def _table(self, name: str, rows: Iterable[Row], description: str) -> None:
-        self._board.put(name, "table", json.dumps(list(rows)), description, task_run=_task_run())
+    def _table(self, name: str, rows: Iterable[Row], description: str, *, changing: bool = False) -> None:
+        """With `changing`, one table for the whole run, so that the server's database does not grow with it."""
+        self._put(name, "table", json.dumps(list(rows)), description, changing)
 
-    def _image(self, name: str, url: str, description: str) -> None:
-        self._board.put(name, "image", url, description, task_run=_task_run())
+    def _image(self, name: str, url: str, description: str, *, changing: bool = False) -> None:
+        """Likewise."""
+        self._put(name, "image", url, description, changing)
+
+    def _put(self, name: str, kind: str, data: str, description: str, changing: bool) -> None:
+        of_the_run = None if changing else _task_run()
+        self._board.put(name, kind, data, description, task_run=of_the_run, changing=name if changing else "")
 
     def _logger(self) -> Any:
         """That of the task where there is one, so that the dashboard shows the line there."""

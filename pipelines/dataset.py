@@ -12,7 +12,16 @@ from pathlib import Path
 
 from packuv.progress import Progress, no_progress
 from pipelines.folder import IDENTITY
-from sync.capture import LONGEST_NAME, SETTINGS, Capture, CaptureSettings, check_name, find_capture, natural_key
+from sync.capture import (
+    LONGEST_NAME,
+    SETTINGS,
+    Capture,
+    CaptureSettings,
+    check_name,
+    find_capture,
+    holds_pictures_of_cameras,
+)
+from sync.natural import natural_key
 
 READERS = 4
 """Threads that read: a disk or a network serves some requests at once, and one core hashes what a fast disk gives"""
@@ -45,7 +54,7 @@ class Survey:
 
 
 def survey(dataset: Path, *, progress: Progress = no_progress) -> Survey:
-    """Find the capture folders: those that hold `videos/` or capture.toml.
+    """Find the capture folders: those that hold `videos/` or capture.toml, or pictures of cameras as published.
 
     Hidden folders, captures within captures and what `packuv run` wrote are passed over; a folder that several links
     lead to counts once. A capture with a fault is one of them, and says so.
@@ -103,7 +112,7 @@ def sentence(error: ValueError | OSError) -> str:
 
 def holds_capture(folder: Path) -> bool:
     """Whether a folder is taken for one capture, be it a whole one or not."""
-    return (folder / "videos").is_dir() or (folder / SETTINGS).is_file()
+    return (folder / "videos").is_dir() or (folder / SETTINGS).is_file() or holds_pictures_of_cameras(folder)
 
 
 def _capture_folders(dataset: Path, unreadable: list[Path]) -> Iterator[Path]:

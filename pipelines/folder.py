@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sync.capture import Capture
+from tasks.artefacts.digests import signature
 from tasks.artefacts.recipe import write_json
 
 IDENTITY = "sequence.json"
@@ -36,5 +37,5 @@ def claim(folder: Path, capture: Capture) -> None:
 
 
 def _identity(capture: Capture) -> dict[str, Any]:
-    videos = {name: path.stat().st_size for name, path in capture.videos.items()}
+    videos = {name: signature(path)[0] for name, path in capture.videos.items()}
     return {"capture": str(capture.folder.resolve()), "videos": videos}

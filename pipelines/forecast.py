@@ -17,8 +17,7 @@ from pipelines.disk import size_text
 from pipelines.options import SequenceOptions
 from pipelines.probe import CAMERAS, INSTANTS, REFERENCE, Look, Probe, look, remember, remembered, spread
 from pipelines.request import STAGES
-from sync.capture import Capture
-from sync.probe import probe_video
+from sync.capture import Capture, probe_capture
 from tasks.artefacts.jobs import Jobs
 from tasks.stages.footage import PictureOptions
 from tasks.stages.plan import Plan
@@ -177,7 +176,7 @@ def minutes_text(minutes: float) -> str:
 
 def size_of(capture: Capture, plan: Plan) -> Size:
     """Of what a plan means to process; reads the videos' packets. Raises what `probe_video` raises."""
-    videos = {name: probe_video(path) for name, path in capture.videos.items()}
+    videos = probe_capture(capture)
     longest = max(video.frame_count for video in videos.values())
     frames = min(longest, plan.stop or longest) - plan.first
     if frames < 1:

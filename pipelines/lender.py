@@ -39,7 +39,7 @@ def lender_of(
     store = Store(store_of(workshop.store.root, lender.name))
     claim(store.root.parent, lender)
     originals = Originals(lender, store.root.parent / "file_digests.json")
-    own = Workshop(store, originals, workshop.jobs, Elsewhere(workshop.listener, lender.name))
+    own = Workshop(store, originals, workshop.jobs, Elsewhere(workshop.listener, lender.name), workshop.maker)
     return Sequence(own, plan, options, engine(own.make), Made())
 
 

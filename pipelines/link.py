@@ -138,6 +138,8 @@ def _hear(client: SyncPrefectClient, flow_run: UUID, jobs: Cancellable) -> None:
     state = client.read_flow_run(flow_run).state
     if state is not None and (state.is_cancelling() or state.is_cancelled()):
         jobs.cancel("the run was cancelled")
+    elif state is not None and state.is_crashed():  # somebody took it for dead, and may have started another
+        jobs.cancel("the run was given up")
 
 
 def end_process(sentence: str) -> None:

@@ -26,7 +26,7 @@ from packuv.tables import column_types, optional_fields
 from pipelines.dataset import READERS, Found, Survey, sentence
 from sync.capture import Capture, file_timecodes
 from sync.probe import VideoInfo, probe_video
-from tasks.artefacts.digests import SETTLED_SECONDS, signature
+from tasks.artefacts.digests import SETTLED_SECONDS, folder_digest, signature
 
 VERSION = "1"
 AHEAD = 2 * READERS
@@ -45,17 +45,18 @@ class Row:
     """Folder, absolute"""
     camera: str | None = None
     path: str | None = None
-    """Of the video, relative to the capture, as are all below"""
+    """Of the video, or of the folder of pictures, relative to the capture, as are all below"""
     codec: str | None = None
     width: int | None = None
-    """Pixels, as stored"""
+    """Pixels, as shown"""
     height: int | None = None
     frames: int | None = None
     fps: str | None = None
     """Nominal, a number or a fraction as 30000/1001"""
     duration_s: float | None = None
     timecodes: str | None = None
-    """Where times come from: 'file', 'label' (the container's, after its SMPTE start label) or 'container'"""
+    """Where times come from: 'file', 'label' (the container's, after its SMPTE start label), 'container', or 'number'
+    (that of each picture)"""
     timecode_path: str | None = None
     calibration: str | None = None
     """None: the rig is solved"""
@@ -257,7 +258,7 @@ def _read(path: Path, tell: Callable[[int], None], stop: threading.Event) -> dic
         seen = signature(path)
         facts |= {"bytes": seen[0], "mtime_ns": seen[1]}
         try:
-            facts |= _probe_columns(probe_video(path))
+            facts |= _probe_columns(probe_video(path), timed=not path.is_dir())
         except ValueError as error:
             tell(seen[0])
             facts["problem"] = sentence(error)
@@ -272,20 +273,23 @@ def _read(path: Path, tell: Callable[[int], None], stop: threading.Event) -> dic
     return facts
 
 
-def _probe_columns(info: VideoInfo) -> dict[str, Any]:
+def _probe_columns(info: VideoInfo, *, timed: bool) -> dict[str, Any]:
+    """`timed`: pictures in a folder have no rate of their own."""
     return {
         "codec": info.codec,
         "width": info.width,
         "height": info.height,
         "frames": info.frame_count,
-        "fps": str(info.rate),
-        "duration_s": info.duration_ns / 1e9,
+        "fps": str(info.rate) if timed else None,
+        "duration_s": info.duration_ns / 1e9 if timed else None,
         "start_label": info.start_label,
     }
 
 
 def _digest(path: Path, tell: Callable[[int], None], stop: threading.Event) -> str:
-    """SHA-256 of a file that may be large: others hear how far it is, and can end it."""
+    """`file_digest` of what may be large: others hear how far it is, and can end it."""
+    if path.is_dir():
+        return folder_digest(path, lambda file: _digest(file, tell, stop))
     sha256, buffer = hashlib.sha256(), memoryview(bytearray(CHUNK))
     with path.open("rb", buffering=0) as file:
         while count := file.readinto(buffer):
@@ -343,6 +347,8 @@ def _time_source(capture: Capture, camera: str, video: Mapping[str, Any]) -> str
         return "file" if camera in capture.timecodes else None
     if "codec" not in video:
         return None
+    if capture.videos[camera].is_dir():
+        return "number"
     return "label" if video.get("start_label") else "container"
 
 

@@ -19,6 +19,7 @@ from packuv.fit.device import choose_device
 from packuv.partial import partial_path
 from pipelines.chain import Submit
 from pipelines.choice import PILOT_FRAMES, Affordable, Priced, affordable, check_judges, chosen_of
+from pipelines.crew import CORES_PER_JOB, crew_of
 from pipelines.events import Event, Journal
 from pipelines.folder import claim
 from pipelines.forecast import Forecast, Guess, Machine, forecast, machine_of, question_of, size_of
@@ -37,7 +38,7 @@ from tasks.artefacts.recipe import plain, write_json
 from tasks.artefacts.retention import RUN
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key, Store
-from tasks.artefacts.workshop import Workshop
+from tasks.artefacts.workshop import Maker, Workshop, make_here
 from tasks.report.facts import Choice
 from tasks.report.findings import Finding, findings
 from tasks.report.record import summary
@@ -54,8 +55,6 @@ MOST_FINDINGS = 8
 """That the terminal shows"""
 WORTH_MINUTES = 2.0
 """A run that seems to take less is not worth the seconds of a look at machine and capture"""
-CORES_PER_JOB = 4
-"""A fit's threads wait for each other often enough that a big machine is better used by several fits side by side"""
 
 
 @dataclass(frozen=True)
@@ -125,6 +124,8 @@ class Engine:
 
     submitter: Callable[[Callable[[Stage], Key]], Submit]
     """Given who makes stages, starts them"""
+    maker: Maker = make_here
+    """Who makes them"""
     place: Place | None = None
     """Where the workflow engine knows the run"""
     crashed: Callable[[Place], None] = lambda place: None
@@ -135,9 +136,11 @@ class Engine:
 
 def process_directly(request: RunRequest, journal: Journal, jobs: Jobs | None = None) -> Outcome:
     """Process a sequence in this process and its jobs, without the workflow engine."""
-    with ThreadPoolExecutor(max_workers=jobs_at_once(request)) as pool:
-        engine = Engine(lambda make: lambda stage: pool.submit(make, stage))
-        return process(request, journal, engine, jobs or jobs_of(request))
+    with crew_of(request) as crew, ThreadPoolExecutor(max_workers=jobs_at_once(crew.request)) as pool:
+        if crew.told:
+            journal.told("cluster", crew.told)
+        engine = Engine(lambda make: lambda stage: pool.submit(make, stage), crew.maker)
+        return process(crew.request, journal, engine, jobs or jobs_of(crew.request))
 
 
 def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -> Outcome:
@@ -155,6 +158,7 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
     on_record = registered(
         folder, sequence=run.name, capture=request.capture, preset=request.preset, engine=engine.place
     )
+    flow_run = engine.place.flow_run if engine.place else None
     with workshop.store.in_use(), on_record as register, journal.heard_by(register):
         try:
             sequence, run = settle(sequence, run, engine, affordable)
@@ -165,16 +169,19 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
             jobs.cancel()
             journal.wait_until_idle(IDLE_SECONDS)
             with suppress(OSError):  # the first fault counts
-                write_json(folder / RUN, run_json(run, ending_of(error)))
+                write_json(folder / RUN, run_json(run, ending_of(error), flow_run))
                 if isinstance(error, (Exception, KeyboardInterrupt)) and not isinstance(error, CancelledError):
                     _leave_finished(sequence, folder)
             raise
-        write_json(folder / RUN, run_json(replace(run, choice=outcome.choice), Ending("finished", outcome.missed)))
+        finished = Ending("finished", outcome.missed)
+        write_json(folder / RUN, run_json(replace(run, choice=outcome.choice), finished, flow_run))
         return outcome
 
 
 def foreseen(run: Run, journal: Journal) -> Forecast | None:
-    """What the run will take, had nothing been there; None where that is not worth a look."""
+    """What the run will take, had nothing been there; None where that is not worth a look, or others do the work."""
+    if run.request.cluster is not None:
+        return None
     capture, jobs, folder = run.workshop.capture, run.workshop.jobs, run.workshop.store.root.parent
     size, at_once = size_of(capture, run.plan), jobs_at_once(run.request)
     question = question_of(run.plan, size, (run.options,))
@@ -282,7 +289,7 @@ def prepare(
     folder = Path(request.out) / capture.name
     claim(folder, capture)
     originals = Originals(capture, folder / "file_digests.json")
-    workshop = Workshop(Store(folder / "store"), originals, jobs, journal)
+    workshop = Workshop(Store(folder / "store"), originals, jobs, journal, engine.maker)
     lender = lender_of(request, capture, workshop, engine.submitter)
     # Points are judged alike: small pictures score higher.
     judged = options_of(request, capture, request.preset).pictures if request.target_psnr is not None else None

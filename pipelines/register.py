@@ -1,7 +1,8 @@
 """Runs that are under way, on record where everybody can read them: <out>/<sequence>/.running/<id>.json.
 
 A run holds a lock as long as it lives, and the kernel frees it however the run ends. A record whose lock is free is
-that of a run which was killed; whoever finds it closes it. No server is needed for that.
+that of a run which was killed; whoever finds it closes it. No server is needed for that. Locks may not reach other
+machines, so a run also renews the time of the lock's file, see `tasks.artefacts.presence`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import contextlib
 import json
 import os
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -17,6 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pipelines.events import Event, Forecast
+from tasks.artefacts.presence import LEASE_SECONDS, Beat, is_alive, is_here, machine, own_name
 from tasks.artefacts.recipe import restore, write_json
 from tasks.artefacts.retention import RUN
 from tasks.artefacts.store import try_lock
@@ -24,7 +27,9 @@ from tasks.artefacts.store import try_lock
 RUNNING = ".running"
 SAVE_SECONDS = 2.0
 """Least time between two notes of progress"""
-SILENT_SECONDS = 120.0
+HEARTBEAT_SECONDS = 20.0
+"""Between two notes at the latest, for those who do not see the lock"""
+SILENT_SECONDS = LEASE_SECONDS
 """A run on another machine, whose lock this one may not see, counts as killed after such a silence"""
 
 
@@ -67,6 +72,13 @@ class RunRecord:
     stages: tuple[Moving, ...] = ()
     ended: int = 0
     """Stages that came to an end"""
+    process: str = ""
+    """Name of the process for all machines, see `tasks.artefacts.presence.own_name`"""
+
+    @property
+    def here(self) -> bool:
+        """Whether `pid` means a process of this machine."""
+        return is_here(self.process)
 
 
 @dataclass(frozen=True)
@@ -76,6 +88,8 @@ class Found:
     path: Path
     record: RunRecord
     alive: bool
+    held: bool = False
+    """Its lock is, as far as this machine sees locks"""
 
     @property
     def folder(self) -> Path:
@@ -103,10 +117,12 @@ class Register:
         self._active: dict[str, Forecast] = {}
         self._ended = 0
         self._saved = 0.0
+        self._guard = threading.Lock()
         self.save()
 
     def began(self, label: str, forecast: Forecast) -> None:
-        self._active[label] = forecast
+        with self._guard:
+            self._active[label] = forecast
         self.save()
 
     def moved(self, label: str, forecast: Forecast) -> None:
@@ -114,18 +130,36 @@ class Register:
             self.save()
 
     def ended(self, event: Event) -> None:
-        self._active.pop(event.label, None)
-        self._ended += 1
+        with self._guard:
+            self._active.pop(event.label, None)
+            self._ended += 1
         self.save()
 
     def told(self, label: str, text: str) -> None: ...
 
     def save(self) -> None:
         """Write the record; a disk that is full must not end the run for it."""
-        self._saved = time.monotonic()
-        stages = tuple(_moving(label, forecast) for label, forecast in self._active.items())
-        with contextlib.suppress(OSError):
+        with self._guard, contextlib.suppress(OSError):
+            self._saved = time.monotonic()
+            stages = tuple(_moving(label, forecast) for label, forecast in self._active.items())
             write_json(self._path, replace(self._record, updated=_now(), stages=stages, ended=self._ended))
+
+    @contextlib.contextmanager
+    def beating(self) -> Iterator[None]:
+        """Write it now and then while the block runs, also through a stage that says nothing for long."""
+        over = threading.Event()
+
+        def beat() -> None:
+            while not over.wait(HEARTBEAT_SECONDS):
+                self.save()
+
+        thread = threading.Thread(target=beat, name="heartbeat", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
 
 
 @contextlib.contextmanager
@@ -139,13 +173,15 @@ def registered(
     place = folder / RUNNING
     place.mkdir(parents=True, exist_ok=True)
     started, host = datetime.now(UTC), socket.gethostname()
-    path = place / f"{started:%Y%m%dT%H%M%S%f}-{os.getpid()}.json"
+    path = place / f"{started:%Y%m%dT%H%M%S%f}-{os.getpid()}-{machine()}.json"
     when = started.isoformat(timespec="seconds")
-    record = RunRecord(sequence, capture, preset, host, os.getpid(), when, when, engine)
+    record = RunRecord(sequence, capture, preset, host, os.getpid(), when, when, engine, process=own_name())
     with open(_lock_of(path), "ab") as lock:
         try_lock(lock.fileno())
         try:
-            yield Register(path, record)
+            register = Register(path, record)
+            with Beat(_lock_of(path), again=True), register.beating():
+                yield register
         finally:
             Found(path, record, alive=False).close()
 
@@ -178,16 +214,15 @@ def find_runs(folder: Path) -> list[Found]:
     for path in sorted((folder / RUNNING).glob("*.json")):
         with contextlib.suppress(OSError, ValueError):  # it ended meanwhile
             record = restore(RunRecord, json.loads(path.read_text()))
-            found.append(Found(path, record, _alive(path, record)))
+            held = _held(path)
+            found.append(Found(path, record, held or is_alive(_lock_of(path), record.process), held))
     return found
 
 
-def _alive(path: Path, record: RunRecord) -> bool:
+def _held(path: Path) -> bool:
     with contextlib.suppress(FileNotFoundError), open(_lock_of(path), "rb") as lock:
-        if not try_lock(lock.fileno(), shared=True):
-            return True
-    silence = datetime.now(UTC) - datetime.fromisoformat(record.updated)
-    return record.host != socket.gethostname() and silence.total_seconds() < SILENT_SECONDS
+        return not try_lock(lock.fileno(), shared=True)
+    return False
 
 
 def _lock_of(path: Path) -> Path:

@@ -68,6 +68,9 @@ class RunRequest:
     memory_gb: float = 2.0
     """Of each job, for pictures and layers of the backdrop, 10^9 bytes; what does not fit is read or made again each
     time. No result depends on it"""
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers make the stages, as tcp://10.0.0.5:8786; none: this machine does.
+    Capture and output folder must lie under the same path on all of them. See docs/deployment.md"""
 
     def __post_init__(self) -> None:
         choices_of = {"preset": PRESETS, "quality": QUALITIES, "stop_after": STAGES, "device": get_args(Device)}
@@ -88,6 +91,8 @@ class RunRequest:
         if self.target_psnr is not None and STAGES.index(self.stop_after) < STAGES.index("evaluate"):
             raise ValueError(f"target_psnr needs the scores, but the run stops after {self.stop_after}")
         parse_range(self.frames)
+        if self.cluster is not None:
+            check_address(self.cluster)
 
     @property
     def instants(self) -> tuple[int, int | None]:
@@ -99,6 +104,12 @@ def check_memory(gigabytes: float) -> None:
     """Raises ValueError for less than nothing, or what is no number."""
     if not 0 <= gigabytes < math.inf:
         raise ValueError(f"memory_gb must be 0 or more, 10^9 bytes, but is {gigabytes}")
+
+
+def check_address(text: str) -> None:
+    """Raises ValueError for what is no address of a scheduler."""
+    if not re.fullmatch(r"(tcp|tls)://(\[[0-9a-fA-F:.]+\]|[\w.-]+):\d{1,5}", text):
+        raise ValueError(f"a cluster is named by its scheduler, as tcp://10.0.0.5:8786, but is {text!r}")
 
 
 def parse_range(text: str) -> tuple[int, int | None]:

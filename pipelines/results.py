@@ -17,7 +17,7 @@ import numpy as np
 import packuv
 from calibration.accept import RigReport
 from calibration.rig import Rig
-from packuv.footage import Light
+from packuv.footage import Light, damage_told
 from packuv.scene import open_scene
 from packuv.score import read_table
 from pipelines.events import Event, Journal
@@ -50,9 +50,9 @@ from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
 from tasks.stages.fitting import REFUSED
 from tasks.stages.footage import LIGHT, RIG
-from tasks.stages.light import read_steady
+from tasks.stages.light import read_damage, read_steady
 from tasks.stages.plan import Plan
-from tasks.stages.synchronize import read_videos
+from tasks.stages.synchronize import FOOTAGE, read_videos
 from tasks.stages.track import read_curve, read_keyframes
 
 WHOLE = (SCENE, PAGE_NAME, JSON_NAME, "run.json")
@@ -99,14 +99,18 @@ def ending_of(error: BaseException) -> Ending:
     return Ending("stopped", "Ctrl-C" if isinstance(error, KeyboardInterrupt) else "ended by a signal")
 
 
-def run_json(run: Run, ending: Ending) -> dict[str, Any]:
-    """Which artefacts with which options, what was skipped and why, and how long it took; also of a failed run."""
+def run_json(run: Run, ending: Ending, flow_run: str | None = None) -> dict[str, Any]:
+    """Which artefacts with which options, what was skipped and why, and how long it took; also of a failed run.
+
+    `flow_run` is its UUID in the workflow engine.
+    """
     events = run.journal.events
     return {
         "sequence": run.name,
         "outcome": ending.outcome,
         "reason": ending.reason,
         "packuv": packuv.__version__,
+        "flow_run": flow_run,
         "command": shlex.join(sys.argv),
         "started": run.started.isoformat(timespec="seconds"),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -158,6 +162,7 @@ def collect(run: Run) -> ReportInput:
         rig=Rig.load(rig_folder / RIG) if rig_folder else None,
         held_out=run.plan.held_out,
         check=_check(run),
+        footage=tuple(_footage_notes(run)),
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
         unlike=_points_notes(run).get("unlike", {}),
         log_like=tuple(_points_notes(run).get("log_like", ())),
@@ -220,6 +225,16 @@ def _check(run: Run) -> RigReport | None:
     report = RigReport(**json.loads((folder / CHECK).read_text()))
     refused = run.workshop.store.receipt(background).notes.get(REFUSED, {}) if background else {}
     return replace(report, suspicious={**report.suspicious, **refused})
+
+
+def _footage_notes(run: Run) -> Iterator[str]:
+    sync, light = run.made.get("sync"), run.folder("light")
+    if sync:
+        yield from run.workshop.store.receipt(sync).notes.get(FOOTAGE, ())
+    if light:
+        yield from (damage_told(name, facts) for name, facts in read_damage(light).items())
+    elif run.folder("points"):
+        yield "damaged pictures were not looked for, since light.enabled is false"
 
 
 def _points_notes(run: Run) -> Mapping[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -21,6 +22,7 @@ from prefect.settings import PREFECT_API_URL
 from prefect.states import Cancelled, Crashed, Failed
 from prefect.task_runners import ThreadPoolTaskRunner
 
+from pipelines.crew import Crew, crew_of
 from pipelines.dashboard import Dashboard, run_tags
 from pipelines.events import Journal
 from pipelines.link import FLUSH_SECONDS, Link
@@ -50,7 +52,8 @@ def sequence_flow(
         Args:
             request: Which capture, where to, and how.
         """
-        outcome = _process(request, journal(), link(), jobs(request))
+        with crew_of(request) as crew:
+            outcome = _process(crew, journal(), link(), jobs(crew.request))
         if isinstance(outcome, State):
             return outcome
         ended(outcome)
@@ -87,7 +90,8 @@ def log_to_the_server_only() -> None:
     root.addHandler(logging.NullHandler())  # with none at all, Python would write warnings to the terminal
 
 
-def _process(request: RunRequest, journal: Journal, link: Link, jobs: Jobs) -> Outcome | State[Any]:
+def _process(crew: Crew, journal: Journal, link: Link, jobs: Jobs) -> Outcome | State[Any]:
+    request = crew.request
     context = FlowRunContext.get()
     assert context is not None
     assert context.flow_run is not None
@@ -100,7 +104,10 @@ def _process(request: RunRequest, journal: Journal, link: Link, jobs: Jobs) -> O
         dashboard = Dashboard(link, run_id, capture.name, store)
         place = Place(PREFECT_API_URL.value() or "", str(run_id))
         with journal.heard_by(dashboard), _runner(request) as runner:
-            engine = Engine(lambda make: submitter(make, runner), place, lambda old: set_crashed(link, old), True)
+            if crew.told:
+                journal.told("cluster", crew.told)
+            crashed = partial(set_crashed, link)
+            engine = Engine(lambda make: submitter(make, runner), crew.maker, place, crashed, watched=True)
             outcome = process(request, journal, engine, jobs)
             dashboard.summarize(outcome)
             return outcome

@@ -32,6 +32,8 @@ from tasks.artefacts.recipe import write_json
 from tasks.artefacts.store import try_lock
 
 START_SECONDS = 300
+ANSWER_SECONDS = 60
+"""For a server that was there before to answer"""
 DATABASE = "prefect.db"
 DATABASE_VARIABLE = "PREFECT_SERVER_DATABASE_CONNECTION_URL"
 MEMORY = Path("/dev/shm")
@@ -86,7 +88,8 @@ class Server:
     def wait_ready(self) -> None:
         """Return when the server answers; raises RuntimeError that says where to look if it does not."""
         try:
-            with urllib.request.urlopen(f"{self.address}/health", timeout=START_SECONDS) as answer:
+            patience = START_SECONDS if self.process else ANSWER_SECONDS
+            with urllib.request.urlopen(f"{self.address}/health", timeout=patience) as answer:
                 answer.read()
         except (urllib.error.URLError, OSError) as problem:
             where = f"; see {self.log}" if self.log else " (PREFECT_API_URL)"

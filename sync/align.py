@@ -8,8 +8,8 @@ whole recording walks the index in order (`merge_nearest`) and gives exactly wha
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import pyarrow as pa
 from numba import njit
 
 from sync.clock import Clock, ClockMode, ClockState, fit_clock, measure_clock
+from sync.probe import CONTAINER_TIMES
 from sync.timecode import Timecodes
 from sync.tree import FrameTree, merge_nearest, write_whole
 
@@ -162,6 +163,12 @@ class CameraReport:
     residual_p95_ns: float
     histogram: tuple[int, ...]
     """Matches by residual, in equal bins from minus to plus the tolerance"""
+    source: str = ""
+    """Where its times come from"""
+    read: tuple[str, ...] = ()
+    """What had to be assumed or mended to read them"""
+    drift: Clock | None = None
+    """How its frames run away from the reference's although clocks are trusted; None where they do not"""
 
 
 @dataclass(frozen=True)
@@ -189,23 +196,26 @@ class SyncReport:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a person should look at, one sentence each."""
-        return tuple(note for report in self.cameras for note in _notes(report, self))
+        return (*_common_notes(self), *(note for report in self.cameras for note in _notes(report, self)))
 
     def to_json(self) -> dict[str, Any]:
         data = asdict(self)
         data["clock"] = str(self.clock)
         data["cameras"] = [
-            {**asdict(report), "clock": report.clock.to_json(), "histogram": list(report.histogram)}
+            {
+                **asdict(report),
+                "clock": report.clock.to_json(),
+                "histogram": list(report.histogram),
+                "read": list(report.read),
+                "drift": report.drift and report.drift.to_json(),
+            }
             for report in self.cameras
         ]
         return {**data, "notes": list(self.notes)}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> SyncReport:
-        cameras = tuple(
-            CameraReport(**{**item, "clock": Clock.from_json(item["clock"]), "histogram": tuple(item["histogram"])})
-            for item in data["cameras"]
-        )
+        cameras = tuple(_camera_from_json(item) for item in data["cameras"])
         fields = {name: value for name, value in data.items() if name != "notes"}
         return cls(**{**fields, "clock": ClockMode(data["clock"]), "cameras": cameras})
 
@@ -223,6 +233,17 @@ class SyncReport:
         return cls.from_json(report)
 
 
+def _camera_from_json(item: Mapping[str, Any]) -> CameraReport:
+    drift = item.get("drift")
+    parsed = {
+        "clock": Clock.from_json(item["clock"]),
+        "histogram": tuple(item["histogram"]),
+        "read": tuple(item.get("read", ())),
+        "drift": None if drift is None else Clock.from_json(drift),
+    }
+    return CameraReport(**{**item, **parsed})
+
+
 def align(timecodes: Mapping[str, Timecodes], options: AlignOptions | None = None) -> tuple[FrameGroups, SyncReport]:
     """Match the frames of all cameras to the frames of a reference camera.
 
@@ -234,8 +255,8 @@ def align(timecodes: Mapping[str, Timecodes], options: AlignOptions | None = Non
         options: None means the defaults.
 
     Raises:
-        ValueError: no cameras, an unknown reference, no frame period to derive a tolerance from, or frames of no
-            other camera within the tolerance of the reference's.
+        ValueError: no cameras, an unknown reference, no frame period to derive a tolerance from, frames of no other
+            camera within the tolerance of the reference's, or no instant at which every camera has a frame.
     """
     options = options or AlignOptions()
     if not timecodes:
@@ -253,9 +274,16 @@ def align(timecodes: Mapping[str, Timecodes], options: AlignOptions | None = Non
             f"no frame of any camera lies within {tolerance} ns of a frame of {reference!r}; "
             f"the cameras' times span {_spans(times)}: do they share a clock, an epoch and a unit?"
         )
+    if not (groups.frames >= 0).all(axis=1).any():
+        raise ValueError(_never_complete(groups, times, tolerance))
     clocks = fitted or _measure_clocks(groups)
+    drifts = {} if fitted else _find_drifts(times, reference)
     cameras = tuple(
-        _camera_report(camera, timecodes[camera], times[camera], groups, clocks[camera], tolerance) for camera in times
+        replace(
+            _camera_report(camera, timecodes[camera], times[camera], groups, clocks[camera], tolerance),
+            drift=drifts.get(camera),
+        )
+        for camera in times
     )
     return groups, _report(groups, cameras, tolerance, options)
 
@@ -352,6 +380,39 @@ def _fit_clocks(times: Mapping[str, np.ndarray], reference: str) -> dict[str, Cl
     return {**clocks, reference: Clock(ClockState.REFERENCE, int(own[0]))}
 
 
+def _find_drifts(times: Mapping[str, np.ndarray], reference: str) -> dict[str, Clock]:
+    """Of cameras whose frames run away from the reference's, in step with it, by more than a quarter of a frame.
+
+    Trusted clocks have no drift. Where frames follow the reference's all the same, and more or less of them every
+    second, either a clock runs wrong, and pairs of nearest frames are wrong after half a frame, or cameras run free.
+    """
+    own, found = times[reference], dict[str, Clock]()
+    period = frame_period(own)
+    for camera, other in times.items():
+        if camera == reference or not period:
+            continue
+        clock = fit_clock(own, other, period)
+        if clock.state is ClockState.CORRECTED and _run_away(clock, other) > period / 4:
+            found[camera] = clock
+    return found
+
+
+def _run_away(clock: Clock, times: np.ndarray) -> float:
+    """By how much a drift adds up over a recording, ns."""
+    return abs(clock.drift_ppm) * 1e-6 * float(times[-1] - times[0])
+
+
+def _never_complete(groups: FrameGroups, times: Mapping[str, np.ndarray], tolerance: int) -> str:
+    """Why no instant is complete, as far as can be told."""
+    there = (groups.frames >= 0).sum(axis=0)
+    fewest = sorted(zip(there.tolist(), groups.cameras, strict=True))[:4]
+    counts = ", ".join(f"{camera} has one at {count} of {len(groups)}" for count, camera in fewest)
+    return (
+        f"no instant has a frame of every camera within {tolerance} ns: {counts}; the cameras' times span "
+        f"{_spans(times)}; list cameras that filmed at another time under 'ignore' in capture.toml"
+    )
+
+
 def _measure_clocks(groups: FrameGroups) -> dict[str, Clock]:
     clocks = {}
     for column, camera in enumerate(groups.cameras):
@@ -423,13 +484,38 @@ def _camera_report(
         residual_median_ns=float(median),
         residual_p95_ns=float(high),
         histogram=tuple(int(count) for count in counts),
+        source=codes.source,
+        read=codes.notes,
     )
+
+
+def _common_notes(sync: SyncReport) -> list[str]:
+    """Of all cameras together."""
+    blind = [report.camera for report in sync.cameras if report.source == CONTAINER_TIMES]
+    if not blind:
+        return []
+    return [
+        f"times of {_some(blind)} are those of the containers, which begin at 0 wherever a recording began: right "
+        "only if all cameras started at once or the files were cut to a common start"
+    ]
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 4 else f"{', '.join(names[:3])} and {len(names) - 3} more"
 
 
 def _notes(report: CameraReport, sync: SyncReport) -> list[str]:
     name, clock = report.camera, report.clock
     counts = {"duplicate": report.duplicates, "reversed": report.reversals}
-    notes = [f"{name}: {count} {kind} timecodes" for kind, count in counts.items() if count]
+    notes = [f"{name}: {note}" for note in report.read]
+    if report.drift is not None:
+        over = report.drift.drift_ppm * 1e-6 * (report.end_ns - report.start_ns)
+        notes.append(
+            f"{name}: its frames drift by {report.drift.drift_ppm:+.1f} ppm from those of {sync.reference}, "
+            f"{over / 1e6:+.1f} ms or {over / max(sync.period_ns, 1):+.1f} frames over the recording; if one trigger "
+            "fires all cameras, its clock runs wrong and so do the pairs: set clock = 'triggered' in capture.toml"
+        )
+    notes += [f"{name}: {count} {kind} timecodes" for kind, count in counts.items() if count]
     if report.jumps:
         notes.append(f"{name}: {report.jumps} pauses of more than {JUMP_PERIODS} frame periods")
     if report.matched == 0:

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 import unicodedata
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from difflib import get_close_matches
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from sync.clock import ClockMode
-from sync.probe import VideoInfo, container_timecodes
-from sync.timecode import Timecodes, parse_rate, read_shared_timecodes, read_timecodes
+import numpy as np
 
-TIMECODE_SUFFIXES = (".csv", ".txt", ".json")
+from sync.clock import ClockMode
+from sync.natural import natural_key
+from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
+from sync.probe import VideoInfo, container_timecodes, probe_video
+from sync.timecode import SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
+
+VIDEO_FOLDERS = ("videos", "images", "rgbs", "ims")
+"""Where the videos or pictures of the cameras lie: our own layout, then those that data sets publish"""
+BESIDE_TIMECODES = frozenset(
+    {".md", ".pdf", ".html", ".jpg", ".png", ".md5", ".sha256", ".toml", ".yaml", ".yml", ".xml"}
+)
+"""Endings of files in timecodes/ that hold none"""
+UNITS_APART = (-9, -6, -3, 3, 6, 9)
+"""Powers of ten between two units of time"""
+RATE_OFF = 0.1
+"""Share by which timecodes may run faster or slower than the container"""
+LABELS_APART = 1.5
+"""Frames that a label may be off a timecode file: it counts whole ones"""
 SHARED_TIMECODES = "timestamps.csv"
 SETTINGS = "capture.toml"
 SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
-TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10")
+TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10", "linear")
 """Values of `transfer` in capture.toml; what they mean is packuv's, see `packuv.footage.transfer`."""
 SIDECAR_SUFFIXES = frozenset(
     {".aac", ".csv", ".db", ".ini", ".jpeg", ".jpg", ".json", ".log", ".lrv", ".m4a", ".md", ".mp3", ".pdf", ".png"}
@@ -88,12 +103,14 @@ class Capture:
     folder: Path
     name: str
     videos: dict[str, Path]
-    """By camera, without the ignored ones"""
+    """By camera, without the ignored ones; a folder is one of numbered pictures"""
     timecodes: dict[str, Path]
     """By camera; cameras without a file of their own are missing, all may share one"""
     calibration: Path | None
     """File or folder to import; None means that the rig must be solved"""
     settings: CaptureSettings = field(default_factory=CaptureSettings)
+    notes: tuple[str, ...] = field(default=(), compare=False)
+    """What lies beside the videos and was passed over, one sentence each"""
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -111,12 +128,13 @@ def find_capture(folder: Path) -> Capture:
         raise FileNotFoundError(f"{folder} is no folder; a capture is a folder with videos/<camera>.mp4 in it")
     path = folder / SETTINGS
     settings = CaptureSettings.read(path) if path.is_file() else CaptureSettings()
-    videos = _find_videos(folder)
+    inside, videos = _find_videos(folder)
     _check_names(path, settings, videos)
     kept = {camera: video for camera, video in videos.items() if camera not in settings.ignore}
     if len(kept) < 2:
         raise ValueError(
             f"{folder} must hold videos of at least two cameras that are not ignored, but has {list(kept)}"
+            f"{_advice(_passed_over(folder, inside, videos))}"
         )
     timecodes = _find_timecodes(folder, videos)
     if settings.rig_from is not None and settings.calibration is not None:
@@ -128,7 +146,13 @@ def find_capture(folder: Path) -> Capture:
         timecodes={camera: timecodes[camera] for camera in kept if camera in timecodes},
         calibration=_find_calibration(folder, settings.calibration),
         settings=settings,
+        notes=_passed_over(folder, inside, videos),
     )
+
+
+def holds_pictures_of_cameras(folder: Path) -> bool:
+    """Whether a folder holds pictures or videos by camera as data sets publish them: images/<camera>/*.jpg."""
+    return any(_cameras(folder / name) for name in VIDEO_FOLDERS[1:] if (folder / name).is_dir())
 
 
 def find_lender(capture: Capture) -> Capture | None:
@@ -171,10 +195,49 @@ def find_plate(capture: Capture) -> dict[str, Path]:
     if capture.settings.clean_plate is None:
         return {}
     folder = _beside(capture, "clean_plate", capture.settings.clean_plate)
-    videos = _find_videos(folder)
+    _, videos = _find_videos(folder)
     if not any(camera in capture.videos for camera in videos):
         raise ValueError(f"{folder} must have videos of {list(capture.cameras)}, but has {list(videos)}")
     return {camera: videos[camera] for camera in capture.cameras if camera in videos}
+
+
+def probe_capture(capture: Capture, tell: Callable[[int, int, str], None] = lambda *_: None) -> dict[str, VideoInfo]:
+    """What the video of each camera holds; `tell` hears how many are read, of how many, and which is next.
+
+    Pictures, which hold no times, run at the `fps` of capture.toml, or at the rate of most videos, or at 30. Their
+    numbers count from the lowest that any camera begins with, as videos count from their first frame.
+
+    Raises:
+        FileNotFoundError, ValueError: as `probe_video`.
+    """
+    folders = {camera: list_pictures(path) for camera, path in capture.videos.items() if path.is_dir()}
+    infos = dict[str, VideoInfo]()
+    origin = min((int(pictures.numbers[0]) for pictures in folders.values() if pictures.counted), default=0)
+    for camera in sorted(capture.videos, key=lambda camera: camera in folders):  # videos first
+        tell(len(infos), len(capture.videos), camera)
+        videos = [info.rate for name, info in infos.items() if name not in folders]
+        rate = capture.settings.fps or (Counter(videos).most_common(1)[0][0] if videos else None)
+        infos[camera] = probe_video(capture.videos[camera], rate=rate, origin=origin)
+    return {camera: infos[camera] for camera in capture.cameras}
+
+
+def picture_notes(capture: Capture, infos: Mapping[str, VideoInfo]) -> tuple[str, ...]:
+    """How the times of pictures were found, where no file tells them."""
+    folders = [camera for camera, path in capture.videos.items() if path.is_dir()]
+    if not folders or capture.timecodes:
+        return ()
+    listed = {camera: list_pictures(capture.videos[camera]) for camera in folders}
+    starts = {camera: int(pictures.numbers[0]) for camera, pictures in listed.items() if pictures.counted}
+    said = "fps of capture.toml" if capture.settings.fps else "the videos' rate" if len(folders) < len(infos) else ""
+    rate = infos[folders[0]].rate
+    notes = [
+        f"times of {', '.join(folders)} are the numbers of their pictures, at {float(rate):g} per second "
+        f"({said or 'nothing tells it: set fps in capture.toml'})"
+    ]
+    if len(set(starts.values())) > 1:
+        late = ", ".join(f"{camera} at {start}" for camera, start in starts.items() if start > min(starts.values()))
+        notes.append(f"pictures begin at number {min(starts.values())}, but {late}: taken for cameras that began later")
+    return tuple(notes)
 
 
 def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
@@ -190,15 +253,65 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
             does not parse, or its lines do not fit the frames of the video.
     """
     if not capture.timecodes:
-        return {camera: container_timecodes(infos[camera]) for camera in capture.cameras}
-    return file_timecodes(capture, {camera: infos[camera].frame_count for camera in capture.cameras})
+        return together({camera: container_timecodes(infos[camera]) for camera in capture.cameras})
+    frames = {camera: infos[camera].frame_count for camera in capture.cameras}
+    periods = {camera: period for camera in capture.cameras if (period := _period_ns(infos[camera]))}
+    found = together(file_timecodes(capture, frames, periods))
+    labels = {camera: container_timecodes(infos[camera]) for camera in found if infos[camera].start_label}
+    return {
+        camera: codes.noting(
+            *_rate_notes(capture.timecodes[camera], codes, periods.get(camera)), *_label_notes(camera, found, labels)
+        )
+        for camera, codes in found.items()
+    }
 
 
-def file_timecodes(capture: Capture, frames: Mapping[str, int]) -> dict[str, Timecodes]:
+def _period_ns(info: VideoInfo) -> int:
+    """Median time between two frames in the container; 0 for a single one, and for pictures, whose rate is assumed."""
+    return int(np.median(np.diff(info.pts_ns))) if info.frame_count > 1 and not info.numbered else 0
+
+
+def _rate_notes(path: Path, codes: Timecodes, video_ns: int | None) -> Iterator[str]:
+    """Where times run at another rate than the video; raises ValueError where they are off by a unit."""
+    steps = np.diff(codes.times_ns)
+    own = int(np.median(steps[steps > 0])) if (steps > 0).any() else 0
+    if not own or not video_ns:
+        return
+    ratio = own / video_ns
+    for power in UNITS_APART:
+        if abs(ratio / 10.0**power - 1) < RATE_OFF:
+            raise ValueError(
+                f"{path}: frames would be {own / 1e6:.6g} ms apart, but in the video they are {video_ns / 1e6:.6g} ms "
+                "apart, so the unit is another; name the right one in the column, as timestamp_ms"
+            )
+    if abs(ratio - 1) > RATE_OFF:
+        yield f"its timecodes are {own / 1e6:.4g} ms apart, the frames of its video {video_ns / 1e6:.4g} ms"
+
+
+def _label_notes(camera: str, found: Mapping[str, Timecodes], labels: Mapping[str, Timecodes]) -> Iterator[str]:
+    """Where the container's label and the timecode file disagree about when a camera began, seen from the first one."""
+    first = next(iter(found))
+    if camera == first or not {camera, first} <= labels.keys():
+        return
+    by_file, by_label = (
+        int(times[camera].times_ns[0] - times[first].times_ns[0]) for times in (found, together(labels))
+    )
+    steps = np.diff(found[camera].times_ns)
+    if len(steps) and abs(by_file - by_label) > LABELS_APART * float(np.median(np.abs(steps))):
+        yield (
+            f"it begins {by_file / 1e9:+.3f} s after {first} by the timecode files, {by_label / 1e9:+.3f} s by the "
+            "labels in the containers; the files are believed"
+        )
+
+
+def file_timecodes(
+    capture: Capture, frames: Mapping[str, int], periods: Mapping[str, int] | None = None
+) -> dict[str, Timecodes]:
     """Timecodes of these cameras from their files, numbered by the frames of their videos.
 
     Args:
         frames: how many the video has, by camera.
+        periods: time between two of them in the container, ns, by camera, where it is known.
 
     Raises:
         ValueError: as `load_timecodes`.
@@ -212,15 +325,41 @@ def file_timecodes(capture: Capture, frames: Mapping[str, int]) -> dict[str, Tim
     settings = capture.settings
     paths = set(capture.timecodes.values())
     if len(paths) == 1:
-        read = read_shared_timecodes(paths.pop(), capture.cameras, rate=settings.fps, column=settings.timecode_column)
+        read = read_shared_timecodes(
+            paths.pop(), capture.cameras, rate=settings.fps, column=settings.timecode_column, period_ns=periods
+        )
     else:
         read = {
             camera: read_timecodes(
-                capture.timecodes[camera], camera=camera, rate=settings.fps, column=settings.timecode_column
+                capture.timecodes[camera],
+                camera=camera,
+                rate=settings.fps,
+                column=settings.timecode_column,
+                period_ns=(periods or {}).get(camera),
             )
             for camera in frames
         }
-    return {camera: read[camera].numbered(count, camera=camera) for camera, count in frames.items()}
+    return {
+        camera: replace(
+            numbered(read[camera], capture.videos[camera], count, camera=camera),
+            source=f"timecodes/{capture.timecodes[camera].name}",
+        )
+        for camera, count in frames.items()
+    }
+
+
+def numbered(codes: Timecodes, video: Path, count: int, *, camera: str) -> Timecodes:
+    """Timecodes with the numbers of their frames in a video of `count` frames, see `frame_numbers`.
+
+    Of a folder of pictures with missing numbers, a file may have a line for each number instead: those of the missing
+    ones are left out.
+    """
+    if video.is_dir() and len(codes) != count:
+        pictures = list_pictures(video)
+        places = pictures.places()
+        if pictures.counted and len(codes) == int(places[-1]) + 1:
+            return replace(codes, times_ns=codes.times_ns[places], indices=np.arange(len(places), dtype=np.int64))
+    return codes.numbered(count, camera=camera)
 
 
 def check_name(name: str) -> str:
@@ -240,16 +379,6 @@ def check_name(name: str) -> str:
             f"with a letter or digit and end with no dot or space, but is {name!r}"
         )
     return name
-
-
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key that reads digits as numbers.
-
-    >>> sorted(["cam10", "cam2", "cam1b"], key=natural_key)
-    ['cam1b', 'cam2', 'cam10']
-    """
-    parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(part), part) if part[0].isdecimal() else (1, 0, part) for part in parts)
 
 
 def _name(folder: Path, settings: CaptureSettings) -> str:
@@ -275,12 +404,13 @@ def _beside(capture: Capture, key: str, source: str) -> Path:
     return folder
 
 
-def _find_videos(folder: Path) -> dict[str, Path]:
-    inside = folder / "videos"
-    if not inside.is_dir():
+def _find_videos(folder: Path) -> tuple[Path, dict[str, Path]]:
+    """The folder in which they lie, and the videos by camera."""
+    places = [folder / name for name in VIDEO_FOLDERS if (folder / name).is_dir()]
+    if not places:
         raise ValueError(f"{folder} is no capture: it must have a folder 'videos' with one file per camera")
-    files = [path for path in inside.iterdir() if path.is_file() and not path.name.startswith(".")]
-    videos = _by_camera(inside, [path for path in files if path.suffix.lower() not in SIDECAR_SUFFIXES])
+    inside = next((place for place in places if _cameras(place)), places[0])
+    videos = _by_camera(inside, _cameras(inside))
     for camera in videos:
         # a line break would be lines of its own in a COLMAP model, which also reads names of cameras from paths of
         # other systems; an escape sequence would be a command to the terminal
@@ -289,13 +419,59 @@ def _find_videos(folder: Path) -> dict[str, Path]:
                 f"a camera's name must have 1 to {LONGEST_NAME} printable characters, no \\ and no space at its ends, "
                 f"but is {camera!r}, that of a video in {inside}; rename the video"
             )
-    return videos
+    return inside, videos
+
+
+def _cameras(inside: Path) -> list[Path]:
+    """Videos, and folders of numbered pictures."""
+    seen = [path for path in inside.iterdir() if not path.name.startswith(".")]
+    files = [path for path in seen if path.suffix.lower() not in SIDECAR_SUFFIXES | PICTURE_SUFFIXES and path.is_file()]
+    return files + [path for path in seen if path.is_dir() and holds_pictures(path)]
+
+
+def _passed_over(folder: Path, inside: Path, videos: Mapping[str, Path]) -> tuple[str, ...]:
+    """What could be a camera's, and is not taken for it."""
+    notes, cameras = [], set(videos.values())
+    for path in sorted(inside.iterdir(), key=lambda path: natural_key(path.name)):
+        if path.is_dir() and path not in cameras and not path.name.startswith((".", "__", "@")):
+            kinds = ", ".join(sorted(PICTURE_SUFFIXES))
+            notes.append(f"{path.relative_to(folder)}/ is passed over: it holds no numbered pictures ({kinds})")
+    loose = sorted((path.name for path in inside.iterdir() if is_picture(path.name)), key=natural_key)
+    loose = [name for name in loose if not any(_belongs(name, video) for video in videos.values())]
+    if loose:
+        notes.append(
+            f"{inside.name}/ holds {len(loose)} pictures that belong to no video ({loose[0]}): passed over; those of a "
+            f"camera belong in a folder of its own, as {inside.name}/cam01/000000.png"
+        )
+    for name in VIDEO_FOLDERS:
+        if (other := folder / name) != inside and other.is_dir() and (there := _cameras(other)):
+            notes.append(
+                f"{name}/ holds {len(there)} cameras, too, and is passed over: those of {inside.name}/ are read"
+            )
+    return tuple(notes)
+
+
+def _belongs(picture: str, video: Path) -> bool:
+    """Whether a picture's name is that of a preview: cam1.jpg and cam1.mp4.jpg of cam1.mp4."""
+    stem = picture.rpartition(".")[0].lower()
+    return stem in (video.stem.lower(), video.name.lower())
+
+
+def _advice(notes: Iterable[str]) -> str:
+    return "".join(f"; {note}" for note in notes)
 
 
 def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]:
     inside = folder / "timecodes"
-    files = sorted(inside.iterdir()) if inside.is_dir() else []
-    files = [path for path in files if path.suffix.lower() in TIMECODE_SUFFIXES and not path.name.startswith(".")]
+    there = sorted(inside.iterdir()) if inside.is_dir() else []
+    there = [path for path in there if path.is_file() and not path.name.startswith(".")]
+    files = [path for path in there if path.suffix.lower() in SUFFIXES]
+    unknown = [path for path in there if path.suffix.lower() not in {*SUFFIXES, *BESIDE_TIMECODES}]
+    if unread := [path for path in unknown if path.stem in videos or not files]:
+        raise ValueError(
+            f"timecodes are read from files that end in {', '.join(SUFFIXES)}, but {unread[0]} does not; rename it, "
+            "convert it, or take it out of the folder"
+        )
     shared = [path for path in files if path.name == SHARED_TIMECODES and path.stem not in videos]
     if shared and len(files) == 1:
         return dict.fromkeys(videos, shared[0])
@@ -311,10 +487,12 @@ def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]
 
 def _by_camera(folder: Path, files: Iterable[Path]) -> dict[str, Path]:
     found: dict[str, Path] = {}
-    for path in sorted(files, key=lambda path: (natural_key(path.stem), path.name)):
-        if path.stem in found:
-            raise ValueError(f"{folder} has two files for {path.stem!r}: {found[path.stem].name} and {path.name}")
-        found[path.stem] = path
+    named = {path: path.name if path.is_dir() else path.stem for path in files}
+    for path in sorted(named, key=lambda path: (natural_key(named[path]), path.name)):
+        name = named[path]
+        if name in found:
+            raise ValueError(f"{folder} has two files for {name!r}: {found[name].name} and {path.name}")
+        found[name] = path
     return found
 
 

@@ -1,4 +1,4 @@
-"""What a video file holds, from its packets alone: nothing is decoded.
+"""What a video holds, from its packets alone: of a file no more than a picture is decoded, for how it is turned.
 
 Headers lie about frame counts and rates (AVI halves, cut MP4 hides frames), and the frame-exact decoder needs files
 whose packets carry true presentation times. Whatever is not such a file is refused here with the command that makes
@@ -7,19 +7,25 @@ it one (measured: decoders return wrong pictures from MPEG-TS, cut MP4 and AVI w
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
 
 import av
 import numpy as np
 
-from sync.timecode import NANOSECONDS, Timecodes, label_to_frame, labels_to_ns, ticks_to_ns
+from sync.pictures import USUAL_RATE, Pictures, decode_picture, list_pictures
+from sync.timecode import NANOSECONDS, Timecodes, day_of, label_to_frame, labels_to_ns, ticks_to_ns
+from sync.tmcd import timecode_track_rate
 
 STREAM_FORMATS = frozenset({"mpegts", "mpeg", "h264", "hevc", "vvc", "m4v", "mpegvideo", "mjpeg", "obu", "dv"})
 """Containers without a reliable time per frame: transport and program streams, bare codec streams."""
 PICTURE_FORMATS = frozenset({"image2", "tty", "ico"})
+LOOKED_AT = 64
+"""Packets that are decoded to find a picture"""
+CONTAINER_TIMES = "the container's times"
 LONGEST_LOSS_S = Fraction(1, 2)
 """A file may end this much before its header says: the last frame's own duration is often wrong."""
 
@@ -49,24 +55,25 @@ class ColourTags:
     """limited or full"""
 
     @classmethod
-    def of(cls, context: av.VideoCodecContext) -> ColourTags:
-        form = context.format
+    def of(cls, coded: av.VideoCodecContext | av.VideoFrame) -> ColourTags:
+        """Of a stream, or of a picture, whose depth may be that of floating-point numbers."""
+        form = coded.format
         return cls(
             pixel_format=form.name if form else None,
             bit_depth=max(component.bits for component in form.components) if form else None,
-            matrix=MATRICES.get(int(context.colorspace)),
-            transfer=TRANSFER_CURVES.get(int(context.color_trc)),
-            primaries=PRIMARIES.get(int(context.color_primaries)),
-            range=RANGES.get(int(context.color_range)),
+            matrix=MATRICES.get(int(coded.colorspace)),
+            transfer=TRANSFER_CURVES.get(int(coded.color_trc)),
+            primaries=PRIMARIES.get(int(coded.color_primaries)),
+            range=RANGES.get(int(coded.color_range)),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class VideoInfo:
-    """One video stream."""
+    """One video stream, or one folder of pictures."""
 
     width: int
-    """Pixels, as stored"""
+    """Pixels, as shown: turned as the file says"""
     height: int
     codec: str
     rate: Fraction
@@ -81,29 +88,42 @@ class VideoInfo:
     colour: ColourTags
     start_label: str | None = None
     """SMPTE label of the first frame, where the container has one"""
+    label_rate: Fraction | None = None
+    """At which that label counts: its track's own, or the video's"""
+    odd_label: str | None = None
+    """A label that does not exist at that rate, and so is not used"""
+    rotation_deg: int = 0
+    """By which the stored picture is turned to be shown, counter-clockwise, a multiple of 90"""
+    numbered: bool = False
+    """Times are the numbers of pictures"""
+    notes: tuple[str, ...] = ()
+    """What a person should know, one sentence each"""
 
     def __post_init__(self) -> None:
         if self.pts_ns.shape != (self.frame_count,) or self.frame_count < 1:
             raise ValueError(f"{self.frame_count} frames need as many times, but there are {self.pts_ns.shape}")
 
 
-class _Packet(NamedTuple):
-    """What is kept of a packet: its bytes would be the whole file in memory."""
-
-    pts: int | None
-    duration: int
-    is_corrupt: bool
-    is_discard: bool
+PACKET = np.dtype([("pts", np.int64), ("duration", np.int64), ("corrupt", bool), ("discard", bool)])
+"""What is kept of a packet, 18 bytes: its content would be the whole file in memory"""
+UNTIMED = np.iinfo(np.int64).min
+"""pts of a packet without one"""
 
 
-def probe_video(path: Path) -> VideoInfo:
-    """Count the frames of a video and read their times.
+def probe_video(path: Path, *, rate: Fraction | None = None, origin: int | None = None) -> VideoInfo:
+    """Count the frames of a video and read their times. A folder is one of numbered pictures.
+
+    Args:
+        rate: of pictures, which hold no times: numbers per second.
+        origin: number of the picture at time 0; None is that of the first one.
 
     Raises:
         FileNotFoundError: no such file.
         ValueError: not a video, cut short, damaged, or in a form from which frames cannot be taken exactly; the
             message says what to do.
     """
+    if path.is_dir():
+        return _probe_pictures(list_pictures(path), rate or USUAL_RATE, origin)
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file; a capture needs one video per camera")
     if path.stat().st_size == 0:
@@ -121,10 +141,17 @@ def container_timecodes(info: VideoInfo) -> Timecodes:
     Without a label the times begin where the container's do, which is 0 for most: they align cameras only if all
     recordings were started by one trigger or cut from one timeline.
     """
-    times = info.pts_ns
-    if info.start_label is not None:
-        times = labels_to_ns([info.start_label], info.rate) + (times - times[0])
-    return Timecodes(times, np.arange(len(times), dtype=np.int64))
+    times, rate = info.pts_ns, info.label_rate or info.rate
+    numbers = np.arange(len(times), dtype=np.int64)
+    if info.numbered:
+        return Timecodes(times, numbers, source=f"the numbers of its pictures, {float(info.rate):g} per second")
+    if info.start_label is None:
+        odd = f"its container's label {info.odd_label} does not exist at {info.rate} frames per second; it is not used"
+        return Timecodes(times, numbers, source=CONTAINER_TIMES, notes=(odd,) if info.odd_label else ())
+    times = labels_to_ns([info.start_label], rate) + (times - times[0])
+    other = f"its container's label counts at {rate} per second, its video runs at {info.rate}"
+    day, notes = day_of(info.start_label, rate), (other,) if rate != info.rate else ()
+    return Timecodes(times, numbers, day, f"the container's label {info.start_label}", notes)
 
 
 def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
@@ -134,40 +161,113 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         raise ValueError(f"{path} holds no video ({name})")
     if name in STREAM_FORMATS:
         raise ValueError(f"{path} is a stream ({name}) in which frames cannot be sought exactly; {_remedy(path, name)}")
-    packets = [
-        _Packet(packet.pts, packet.duration or 0, packet.is_corrupt, packet.is_discard)
-        for packet in container.demux(stream)
+    look, colour = _Look(), ColourTags.of(stream.codec_context)
+    seen = (
+        (UNTIMED if packet.pts is None else packet.pts, packet.duration or 0, packet.is_corrupt, packet.is_discard)
+        for packet in look.passing(container.demux(stream))
         if packet.size
-    ]
+    )
+    packets = np.fromiter(seen, PACKET)
     _check_whole(path, container, stream, packets)
-    pts = np.sort(np.array(_presentation_times(path, name, stream, packets), dtype=np.int64))
+    pts = np.sort(_presentation_times(path, name, stream, packets))
     assert stream.time_base is not None
     pts_ns = ticks_to_ns(pts, stream.time_base)
     if (np.diff(pts_ns) <= 0).any():
         raise ValueError(f"{path} has frames with one and the same time; {_reencode(path)}")
     rate = _rate(path, stream, pts_ns)
     gap = int(np.median(np.diff(pts_ns))) if len(pts_ns) > 1 else int(NANOSECONDS / rate)
+    sides = (stream.width, stream.height)
+    width, height = sides[::-1] if look.rotation_deg % 180 else sides
+    label, label_rate, odd = _start_label(path, container, stream, rate)
     return VideoInfo(
-        width=stream.width,
-        height=stream.height,
+        width=width,
+        height=height,
         codec=stream.codec_context.name,
         rate=rate,
         frame_count=len(pts_ns),
         pts_ns=pts_ns,
         duration_ns=int(pts_ns[-1] - pts_ns[0]) + gap,
         size_bytes=path.stat().st_size,
-        colour=ColourTags.of(stream.codec_context),
-        start_label=_start_label(container, stream, rate),
+        colour=colour,
+        start_label=label,
+        label_rate=label_rate,
+        odd_label=odd,
+        rotation_deg=look.rotation_deg,
+        notes=_stream_notes(path, container, stream),
     )
 
 
+class _Look:
+    """Looks at the first picture on the way of a stream's packets: containers say how it is turned, PyAV does not."""
+
+    def __init__(self) -> None:
+        self.rotation_deg = 0
+
+    def passing(self, packets: Iterator[av.Packet[av.VideoStream]]) -> Iterator[av.Packet[av.VideoStream]]:
+        left = LOOKED_AT
+        for packet in packets:
+            if left:
+                left -= 1
+                with suppress(av.FFmpegError):  # which reading the pictures will say
+                    for frame in packet.decode():
+                        assert isinstance(frame, av.VideoFrame)
+                        self.rotation_deg, left = round(frame.rotation / 90) % 4 * 90, 0
+                        break
+            yield packet
+
+
+def _stream_notes(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> tuple[str, ...]:
+    attached = av.stream.Disposition.attached_pic
+    others = [other for other in container.streams.video if other is not stream and not other.disposition & attached]
+    if not others:
+        return ()
+    found = ", ".join(f"#{other.index} of {other.width}x{other.height}" for other in others)
+    return (
+        f"{path.stem}: of {len(others) + 1} video streams #{stream.index} of {stream.width}x{stream.height} is read, "
+        f"as players do; {found} is not",
+    )
+
+
+def _probe_pictures(pictures: Pictures, rate: Fraction, origin: int | None) -> VideoInfo:
+    """Raises ValueError where the first and the last picture differ in size, or one of them cannot be decoded."""
+    first, last = (decode_picture(pictures.folder / pictures.names[k]) for k in (0, -1))
+    width, height = _shown(first)
+    if (width, height) != _shown(last):
+        raise ValueError(
+            f"the pictures of a camera must have one size, but in {pictures.folder} {pictures.names[0]} is "
+            f"{width}x{height} and {pictures.names[-1]} {'x'.join(map(str, _shown(last)))}"
+        )
+    times = pictures.times_ns(rate, int(pictures.numbers[0]) if origin is None else origin)
+    suffix = Path(pictures.names[0]).suffix.lower().removeprefix(".")
+    return VideoInfo(
+        width=width,
+        height=height,
+        codec="jpeg" if suffix == "jpg" else suffix,
+        rate=rate / pictures.step if pictures.counted else rate,
+        frame_count=len(pictures),
+        pts_ns=times,
+        duration_ns=int(times[-1] - times[0]) + int(NANOSECONDS / rate),
+        size_bytes=pictures.size_bytes,
+        colour=ColourTags.of(first),
+        rotation_deg=round(first.rotation / 90) % 4 * 90,
+        numbered=True,
+        notes=pictures.notes(pictures.folder.name),
+    )
+
+
+def _shown(frame: av.VideoFrame) -> tuple[int, int]:
+    """Width and height, turned as the picture says."""
+    sides = (frame.width, frame.height)
+    return sides[::-1] if round(frame.rotation / 90) % 2 else sides
+
+
 def _check_whole(
-    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: list[_Packet]
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream, packets: np.ndarray
 ) -> None:
-    if not packets:
+    if not len(packets):
         raise ValueError(f"{path} holds no frames; copy the recording again")
-    broken = next((number for number, packet in enumerate(packets) if packet.is_corrupt), None)
-    if broken is not None:
+    if packets["corrupt"].any():
+        broken = int(packets["corrupt"].argmax())
         raise ValueError(f"{path} is cut short or damaged at frame {broken}; copy the recording again")
     # only MP4 and MOV count samples exactly in their header
     if container.format.name.startswith("mov") and stream.frames > len(packets):
@@ -179,8 +279,8 @@ def _check_whole(
         )
 
 
-def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: list[_Packet]) -> list[int]:
-    hidden = sum(packet.is_discard for packet in packets)
+def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: np.ndarray) -> np.ndarray:
+    hidden = int(packets["discard"].sum())
     if hidden:
         raise ValueError(
             f"{path} was cut without re-encoding: an edit list hides {hidden} of its {len(packets)} frames, and "
@@ -188,9 +288,9 @@ def _presentation_times(path: Path, name: str, stream: av.VideoStream, packets: 
         )
     if name == "avi" and stream.codec_context.has_b_frames:
         raise ValueError(f"{path} is an AVI with B-frames, which has no presentation times; {_reencode(path)}")
-    times = [packet.pts for packet in packets if packet.pts is not None]
-    if len(times) < len(packets):
-        raise ValueError(f"{path} has {len(packets) - len(times)} frames without a time; {_reencode(path)}")
+    times: np.ndarray = packets["pts"]
+    if untimed := int((times == UNTIMED).sum()):
+        raise ValueError(f"{path} has {untimed} frames without a time; {_reencode(path)}")
     return times
 
 
@@ -213,10 +313,10 @@ def _declared_end_s(stream: av.VideoStream) -> Fraction | None:
     return sum((Fraction(part) * 60**power for power, part in zip((2, 1, 0), parts, strict=True)), Fraction(0))
 
 
-def _found_end_s(stream: av.VideoStream, packets: list[_Packet]) -> Fraction:
+def _found_end_s(stream: av.VideoStream, packets: np.ndarray) -> Fraction:
     assert stream.time_base is not None
-    last = max((packet.pts or 0) + packet.duration for packet in packets)
-    return last * stream.time_base
+    begins = np.where(packets["pts"] == UNTIMED, 0, packets["pts"])
+    return int((begins + packets["duration"]).max()) * stream.time_base
 
 
 def _rate(path: Path, stream: av.VideoStream, pts_ns: np.ndarray) -> Fraction:
@@ -229,10 +329,19 @@ def _rate(path: Path, stream: av.VideoStream, pts_ns: np.ndarray) -> Fraction:
     return fits[0] if fits else measured.limit_denominator(1001)
 
 
-def _start_label(container: av.container.InputContainer, stream: av.VideoStream, rate: Fraction) -> str | None:
+def _start_label(
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream, rate: Fraction
+) -> tuple[str | None, Fraction | None, str | None]:
+    """Label of the first frame, the rate it counts at, and one that does not exist at that rate."""
     tracks = [stream.metadata, container.metadata, *(other.metadata for other in container.streams)]
-    label = next((data["timecode"] for data in tracks if "timecode" in data), None)
-    try:
-        return label if label is not None and label_to_frame(label, rate) >= 0 else None
-    except ValueError:
-        return None  # the track counts at another rate than the frames; a wrong time is worse than none
+    # Matroska's writers put it in capitals.
+    found = (value for data in tracks for name, value in data.items() if name.lower() == "timecode")
+    label = next(found, None)
+    if label is None:
+        return None, None, None
+    own = timecode_track_rate(path) if container.format.name.startswith("mov") else None
+    for one in (own, rate):
+        with suppress(ValueError):  # a wrong time is worse than none
+            if one is not None and label_to_frame(label, one) >= 0:
+                return label, one, None
+    return None, None, label

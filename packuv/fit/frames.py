@@ -52,11 +52,18 @@ def fit_segment(
     for instant in instants[1 + len(track.frames) :]:
         views.forget()
         masks = as_bits(motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras)
-        optical_flows = [motion.optical_flow(motion.names.index(camera.name), instant) for camera in views.cameras]
-        track.add(_fit_frame(track.model, key, backdrop, views, instant, masks, optical_flows, options))
+        flows = [_optical_flow(motion, camera.name, instant, options) for camera in views.cameras]
+        track.add(_fit_frame(track.model, key, backdrop, views, instant, masks, flows, options))
         track.checkpoint()
         ticks.advance()
     return track.segment(instants.start), track.figures
+
+
+def _optical_flow(motion: MotionCache, camera: str, instant: int, options: FrameOptions) -> np.ndarray | None:
+    """None also where it was not kept, as of hours: Gaussians then start where they were."""
+    if not (options.lift.enabled and motion.options.keep_flow):
+        return None
+    return motion.optical_flow(motion.names.index(camera), instant)
 
 
 def _fit_frame(

@@ -1,5 +1,6 @@
 """Pictures of a capture: decoded on demand, undistorted, and what each camera makes of light."""
 
+from packuv.footage.damage import DamageLog, damage_told, without
 from packuv.footage.lens import LensCamera
 from packuv.footage.light import Light, LightOptions, measure_light
 from packuv.footage.planes import as_planes
@@ -8,8 +9,10 @@ from packuv.footage.response import Response
 from packuv.footage.suspect import looks_like_log
 from packuv.footage.transfer import Transfer
 from packuv.footage.views import Views
+from packuv.footage.watching import WatchingReader
 
 __all__ = [
+    "DamageLog",
     "FrameReader",
     "LensCamera",
     "Light",
@@ -17,7 +20,10 @@ __all__ = [
     "Response",
     "Transfer",
     "Views",
+    "WatchingReader",
     "as_planes",
+    "damage_told",
     "looks_like_log",
     "measure_light",
+    "without",
 ]

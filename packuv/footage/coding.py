@@ -57,6 +57,25 @@ class Coding:
             height=stream.height,
         )
 
+    @classmethod
+    def of_frame(cls, frame: av.VideoFrame) -> Coding:
+        """What a decoded picture says."""
+        return cls(
+            format=frame.format.name,
+            bits=max(component.bits for component in frame.format.components),
+            matrix=int(frame.colorspace),
+            transfer=int(frame.color_trc),
+            primaries=int(frame.color_primaries),
+            range=int(frame.color_range),
+            width=frame.width,
+            height=frame.height,
+        )
+
+    @property
+    def floating(self) -> bool:
+        """Whether it holds light as floating-point numbers, as EXR does."""
+        return "f32" in self.format or "f16" in self.format
+
     @property
     def in_luma(self) -> bool:
         """Whether the picture is coded as luma and chroma."""

@@ -81,6 +81,38 @@ class Developer:
         return matrix.astype(np.float32), (-matrix @ offset).astype(np.float32)
 
 
+def converted(frame: av.VideoFrame) -> np.ndarray:
+    """By FFmpeg, with the matrix and the range that the frame is tagged with, uint8 [H, W, 3].
+
+    By one thread: with several, FFmpeg 8.0's conversion now and then loses pixels.
+    """
+    picture: np.ndarray = frame.reformat(format="rgb24", interpolation="BILINEAR", threads=1).to_ndarray()
+    return picture
+
+
+def linear_picture(frame: av.VideoFrame, mix: np.ndarray | None) -> np.ndarray:
+    """Of a frame that holds light as floating-point numbers, uint8 [H, W, 3] sRGB; light above 1 is cut off.
+
+    `mix`, [3, 3], makes linear RGB of BT.709 of the frame's.
+    """
+    if frame.format.name.startswith("gray"):
+        grey = frame.reformat(format="grayf32le", threads=1)
+        light = np.repeat(_floats(grey.planes[0])[..., None], 3, axis=2)
+    else:
+        # FFmpeg names these planes green, blue, red.
+        whole = frame if frame.format.name in _PLANAR_FLOATS else frame.reformat(format="gbrpf32le", threads=1)
+        light = np.stack([_floats(whole.planes[plane]) for plane in (2, 0, 1)], axis=2)
+    light = light if mix is None else light @ mix.T.astype(np.float32)
+    picture: np.ndarray = _BYTE_OF_LIGHT[(np.clip(np.nan_to_num(light), 0, 1) * (STEPS - 1) + 0.5).astype(np.uint16)]
+    return picture
+
+
+def _floats(plane: av.video.plane.VideoPlane) -> np.ndarray:
+    """The plane's own memory, float32 [rows, columns]."""
+    memory: np.ndarray = np.frombuffer(plane, dtype="<f4")  # type: ignore[call-overload]  # a plane is a buffer
+    return memory.reshape(plane.height, plane.line_size // 4)[:, : plane.width]
+
+
 def _rounded(value: np.ndarray) -> np.ndarray:
     rounded: np.ndarray = np.floor(np.clip(value, 0, 1) * 255 + 0.5).astype(np.uint8)
     return rounded
@@ -91,6 +123,10 @@ def _array(plane: av.video.plane.VideoPlane, bits: int) -> np.ndarray:
     kind = np.dtype(np.uint8 if bits == 8 else "<u2")
     memory: np.ndarray = np.frombuffer(plane, dtype=kind)  # type: ignore[call-overload]  # a plane is a buffer
     return memory.reshape(plane.height, plane.line_size // kind.itemsize)[:, : plane.width]
+
+
+_PLANAR_FLOATS = ("gbrpf32le", "gbrapf32le")
+_BYTE_OF_LIGHT = _rounded(srgb_from_linear(np.linspace(0, 1, STEPS)))
 
 
 @kernel(fastmath=frozenset({"contract", "nnan"}))

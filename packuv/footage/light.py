@@ -120,11 +120,13 @@ def measure_light(
     options: LightOptions,
     *,
     workers: int = 2,
+    kept: Path | None = None,
     progress: Progress = no_progress,
 ) -> Light:
     """Of cameras with the frame numbers `frames`, int [T], -1 where there is none; light from the fitted ones alone.
 
-    Pictures pass once, camera by camera, `workers` of them at a time.
+    Pictures pass once, camera by camera, `workers` of them at a time. What is measured goes to the folder `kept`, if
+    given, from which the same measurement goes on after a kill.
     """
     told, lock = dict.fromkeys(frames, 0.0), Lock()
     total = sum(int((numbers >= 0).sum()) for numbers in frames.values())
@@ -140,6 +142,7 @@ def measure_light(
             frames[name],
             width=options.width,
             samples=options.samples,
+            kept=None if kept is None else kept / name,
             progress=partial(hear, name),
         )
 

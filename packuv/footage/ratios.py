@@ -6,13 +6,15 @@ dark in the reference, or seen to move, has no say; of the rest, what disagrees 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from packuv.colour import GAMMA, OFFSET
+from packuv.files import save_npz
 from packuv.kernels.compile import kernel
 from packuv.progress import Progress, no_progress
 
@@ -23,6 +25,8 @@ DARKEST, BRIGHTEST = 0.1, 0.85
 """sRGB of pixels that count: below, noise and flare outweigh light; above, a little more of it clips"""
 HELD = 600
 """Small pictures of a camera that are kept for the second look, 43 KB each; longer ones decode their samples twice"""
+KEPT = 1024
+"""Instants of a camera that are kept at a time, and that a kill costs: seconds to decode and compare"""
 PARTS = 4
 """Quarters of the picture that are measured apart as well: light of all of it must show in each"""
 LEAST_PIXELS = 200
@@ -51,6 +55,19 @@ class Ratios:
     """float32 [T, 3]"""
     parts: np.ndarray
     """float32 [T, PARTS, 3]: of each quarter of the picture alone"""
+
+    def keep(self, path: Path, instants: Sequence[int]) -> None:
+        """Write some instants into a file, in a folder that is made where it is missing."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_npz(path, {"whole": self.whole[instants], "parts": self.parts[instants]})
+
+    def read(self, path: Path, instants: Sequence[int]) -> bool:
+        """Take over what `keep` wrote; whether there is such a file."""
+        if not path.exists():
+            return False
+        with np.load(path) as measured:
+            self.whole[instants], self.parts[instants] = measured["whole"], measured["parts"]
+        return True
 
 
 @dataclass(frozen=True)
@@ -85,22 +102,38 @@ class _Reference:
 
 
 def measure_ratios(
-    shot: Shot, frames: np.ndarray, *, width: int, samples: int, progress: Progress = no_progress
+    shot: Shot,
+    frames: np.ndarray,
+    *,
+    width: int,
+    samples: int,
+    kept: Path | None = None,
+    progress: Progress = no_progress,
 ) -> Ratios:
-    """Of the instants t with `frames[t]` >= 0; pictures are shrunk to `width`, `samples` of them make the reference."""
+    """Of the instants t with `frames[t]` >= 0; pictures are shrunk to `width`, `samples` of them make the reference.
+
+    What is measured goes to the folder `kept`, if given, from which the same measurement goes on after a kill.
+    """
     there = np.flatnonzero(frames >= 0).tolist()
-    whole, parts = np.full((len(frames), 3), np.nan, _f32), np.full((len(frames), PARTS, 3), np.nan, _f32)
+    found = Ratios(np.full((len(frames), 3), np.nan, _f32), np.full((len(frames), PARTS, 3), np.nan, _f32))
     if not there:
-        return Ratios(whole, parts)
+        return found
     chosen = [there[k] for k in np.unique(np.linspace(0, len(there) - 1, min(samples, len(there))).round().astype(int))]
     held = {t: _shrunk(shot(t), width) for t in (there if len(there) <= HELD else chosen)}
     reference = _reference(np.stack([held[t] for t in chosen]))
-    for done, t in enumerate(there, start=1):
-        if reference is not None:
-            small = held.pop(t) if t in held else _shrunk(shot(t), width)
-            whole[t], parts[t] = (GAMMA * np.log(factors) for factors in reference.ratio(small))
-        progress(done, len(there))
-    return Ratios(whole, parts)
+    for begin in range(0, len(there) if reference else 0, KEPT):
+        some = there[begin : begin + KEPT]
+        path = kept / f"{begin:09d}.npz" if kept is not None and len(some) == KEPT else None
+        if path is None or not found.read(path, some):
+            for done, t in enumerate(some, start=begin + 1):
+                small = held.pop(t) if t in held else _shrunk(shot(t), width)
+                assert reference is not None
+                found.whole[t], found.parts[t] = (GAMMA * np.log(factors) for factors in reference.ratio(small))
+                progress(done, len(there))
+            if path is not None:
+                found.keep(path, some)
+    progress(len(there), len(there))
+    return found
 
 
 def _shrunk(picture: np.ndarray, width: int) -> np.ndarray:

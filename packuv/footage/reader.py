@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -13,12 +11,20 @@ from typing import TYPE_CHECKING
 import av
 import numpy as np
 
-from packuv.footage.coding import Coding
+from packuv.footage.damage import Damage, DamagedPictureError
 from packuv.footage.exact import ExactDecoder
+from packuv.footage.packets import Packets
+from packuv.footage.pictures import PictureDecoder
 from packuv.footage.transfer import Transfer
 
 if TYPE_CHECKING:
     from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
+
+
+LONG = 1000
+"""Frames of a video from which on what its packets tell is worth a file"""
+TABLES = 1
+"""Version of these files"""
 
 
 class FrameReader:
@@ -30,7 +36,10 @@ class FrameReader:
 
     Every picture is display-referred sRGB, whatever its video holds: more than 8 bits are rounded once, at the end, and
     log curves become light before (`packuv.footage.transfer`). PyAV decodes. FFmpeg makes pictures of what it shows as
-    it is meant, 8-bit video with its matrix named; of the rest we convert the planes.
+    it is meant, 8-bit video with its matrix named; of the rest we convert the planes. A folder is a video of pictures.
+
+    Pictures are turned as their file says. What the decoder had to conceal is given, and so is what is predicted from
+    it; `damage` tells which frames these are.
     """
 
     def __init__(
@@ -40,8 +49,14 @@ class FrameReader:
         transfer: Transfer | None = None,
         threads: int = 1,
         open_limit: int = 128,
+        kept: Path | None = None,
+        careful: bool = False,
     ) -> None:
         """`transfer` is what code values mean; None leaves it to the tags: HLG, PQ, or else a finished picture.
+
+        `kept` is a folder for what the packets of long videos tell, so that the next reader need not demux them.
+
+        `careful` looks for damage of which decoders say nothing, that of JPEG data (60 % more time for these).
 
         `threads` decode one camera; beyond `open_limit` open decoders the longest unused one is closed.
 
@@ -53,8 +68,11 @@ class FrameReader:
         self.transfer = transfer
         self._threads = threads
         self._open_limit = open_limit
-        self._decoders: OrderedDict[str, TorchDecoder | ExactDecoder] = OrderedDict()
+        self._careful = careful
+        self._decoders: OrderedDict[str, Decoder] = OrderedDict()
+        self._damage: dict[str, dict[int, Damage]] = {name: {} for name in self.videos}
         self._found: dict[str, Packets] = {}
+        self._kept = kept
         self._guard = Lock()
         self._locks = {name: Lock() for name in self.videos}
 
@@ -72,10 +90,16 @@ class FrameReader:
                 "file again, or list the camera under ignore in capture.toml"
             )
 
+    def damage(self, camera: str) -> Mapping[int, Damage]:
+        """What is wrong with the frames that were read so far, and with those that rely on them, by number."""
+        with self._lock(camera):
+            return dict(self._damage[camera])
+
     def read(self, camera: str, frame: int) -> np.ndarray:
         """One frame, uint8 [H, W, 3], RGB.
 
-        Raises FileNotFoundError for a missing file; ValueError for a frame that is not there or cannot be decoded.
+        Raises FileNotFoundError for a missing file; ValueError for a frame that is not there, DamagedPictureError for
+        one of which nothing can be decoded.
         """
         with self._lock(camera):
             return self._read(camera, int(frame))
@@ -101,7 +125,7 @@ class FrameReader:
 
     def _packets(self, camera: str) -> Packets:
         if camera not in self._found:
-            self._found[camera] = Packets.read(self.videos[camera])
+            self._found[camera] = Packets.read(self.videos[camera], self._kept)
         return self._found[camera]
 
     def _read(self, camera: str, frame: int) -> np.ndarray:
@@ -111,8 +135,9 @@ class FrameReader:
         try:
             pixels, seconds = self._decoder(camera).read(frame)
         except (RuntimeError, IndexError, ValueError, av.FFmpegError) as error:
+            kind = DamagedPictureError if isinstance(error, DamagedPictureError) else ValueError
             reason = f"cannot be decoded ({_first_line(error)})"
-            raise ValueError(f"{path}: frame {frame} {reason}; {_remux_advice(path)}") from error
+            raise kind(f"{path}: frame {frame} {reason}; {_remux_advice(path)}") from error
         # Half a microsecond: far below any frame time, far above float64 rounding of seconds.
         expected = packets.ticks[frame] * float(packets.base)
         if abs(seconds - expected) > 5e-7:
@@ -122,15 +147,18 @@ class FrameReader:
             )
         return pixels
 
-    def _decoder(self, camera: str) -> TorchDecoder | ExactDecoder:
+    def _decoder(self, camera: str) -> Decoder:
         with self._guard:
             decoder = self._decoders.pop(camera, None)
         if decoder is None:
-            path, packets = self.videos[camera], self._packets(camera)
-            if packets.coding.plain(self.transfer) and packets.coding.coarse:
-                decoder = TorchDecoder(path, threads=self._threads)
+            path, packets, damage = self.videos[camera], self._packets(camera), self._damage[camera]
+            said, careful = self.transfer, self._careful
+            if packets.pictures:
+                decoder = PictureDecoder(path, packets.pictures, damage, said=said, careful=careful)
+            elif packets.coding.plain(self.transfer) and packets.coding.coarse:
+                decoder = TorchDecoder(path, packets.index, threads=self._threads)
             else:
-                decoder = ExactDecoder(path, packets.ticks, packets.keys, said=self.transfer, threads=self._threads)
+                decoder = ExactDecoder(path, packets, damage, said=said, threads=self._threads, careful=careful)
         with self._guard:
             self._decoders[camera] = decoder
             while len(self._decoders) > self._open_limit:
@@ -141,12 +169,13 @@ class FrameReader:
 class TorchDecoder:
     """One open video with chroma coarser than FFmpeg's versions agree about, see `Coding.coarse`."""
 
-    def __init__(self, path: Path, *, threads: int) -> None:
+    def __init__(self, path: Path, stream: int, *, threads: int) -> None:
+        """`stream` is the number of the stream among all of the container."""
         # Here, since it takes seconds, and torch; many processes read no video.
         from torchcodec.decoders import VideoDecoder  # type: ignore[attr-defined]  # it lists no __all__
 
         self._decoder: VideoDecoder = VideoDecoder(
-            str(path), dimension_order="NHWC", num_ffmpeg_threads=threads, seek_mode="exact"
+            str(path), stream_index=stream, dimension_order="NHWC", num_ffmpeg_threads=threads, seek_mode="exact"
         )
 
     def read(self, frame: int) -> tuple[np.ndarray, float]:
@@ -155,53 +184,12 @@ class TorchDecoder:
         return decoded.data.numpy(), decoded.pts_seconds
 
 
-@dataclass(frozen=True, eq=False)
-class Packets:
-    """What demuxing alone tells of a video."""
-
-    ticks: np.ndarray
-    """int64 [n], ascending: when each frame is shown"""
-    base: Fraction
-    """Seconds of a tick"""
-    keys: np.ndarray
-    """int64, ascending: numbers of the key frames"""
-    coding: Coding
-
-    @property
-    def seconds(self) -> np.ndarray:
-        """float64 [n], seconds, ascending."""
-        return self.ticks * float(self.base)
-
-    @classmethod
-    def read(cls, path: Path) -> Packets:
-        """Raises FileNotFoundError for a missing file, ValueError for one that is no video with a time per frame."""
-        if not path.is_file():
-            raise FileNotFoundError(f"no video at {path}")
-        try:
-            with av.open(str(path)) as container:
-                stream = container.streams.video[0]
-                # Packets that an edit list cuts away are marked for discarding; no decoder shows them.
-                times = [
-                    (packet.pts, packet.is_keyframe)
-                    for packet in container.demux(stream)
-                    if packet.pts is not None and packet.size and not packet.is_discard
-                ]
-                base, coding = stream.time_base, Coding.of(stream)
-        except (av.FFmpegError, IndexError, ValueError) as error:
-            raise ValueError(f"{path} cannot be read as a video ({_first_line(error)}); export it again") from error
-        if not times or base is None:
-            raise ValueError(f"{path} holds no timed video frames; remux it (ffmpeg -i {path.name} -c copy out.mkv)")
-        times.sort()
-        ticks, keys = np.array(times, dtype=np.int64).T
-        return cls(np.ascontiguousarray(ticks), base, np.flatnonzero(keys), coding)
-
-
-def packet_seconds(path: Path) -> np.ndarray:
-    """When each frame of a video is shown, by demuxing alone: float64 [n], seconds, ascending."""
-    return Packets.read(path).seconds
+Decoder = TorchDecoder | ExactDecoder | PictureDecoder
 
 
 def _remux_advice(path: Path) -> str:
+    if path.is_dir():
+        return "copy it again"
     remux = f"ffmpeg -i {path.name} -c copy {path.stem}.mkv"
     return f"the file is damaged or its container cannot be searched: remux it ({remux}), or record it again"
 

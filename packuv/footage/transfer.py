@@ -28,6 +28,8 @@ class Transfer(StrEnum):
     LOGC3 = "logc3"
     LOGC4 = "logc4"
     LOG3G10 = "log3g10"
+    LINEAR = "linear"
+    """Light itself"""
 
 
 CODE_CURVES = frozenset({Transfer.SLOG3, Transfer.VLOG, Transfer.CLOG3})
@@ -151,4 +153,5 @@ _CURVES: dict[Transfer, Callable[[np.ndarray], np.ndarray]] = {
     Transfer.LOGC3: _logc3,
     Transfer.LOGC4: _logc4,
     Transfer.LOG3G10: _log3g10,
+    Transfer.LINEAR: np.array,
 }

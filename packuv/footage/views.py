@@ -116,7 +116,11 @@ class Views:
     def steady(self, camera: int, instant: int, *, remember: bool = True) -> np.ndarray | None:
         """`pixels` as steady light and exposure would have them: what differs between two of them has moved."""
         pixels = self.pixels(camera, instant, remember=remember)
-        if pixels is None or self.light is None or not self.light[instant, camera].any():
+        return None if pixels is None else self.steadied(pixels, camera, instant)
+
+    def steadied(self, pixels: np.ndarray, camera: int, instant: int) -> np.ndarray:
+        """What `steady` makes of the `pixels` of a camera and instant, uint8 [H, W, 3]."""
+        if self.light is None or not self.light[instant, camera].any():
             return pixels
         factors = light_factors(self.light[instant, camera])
         table = (np.arange(256)[:, None] / 255 + OFFSET) / factors - OFFSET  # [256, 3]

@@ -13,6 +13,7 @@ import json
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -62,10 +63,10 @@ def measure_motion(
     step. `progress` gets the picture count done and in all. Raises ValueError if the folder holds another measurement.
     """
     _claim(folder, _recipe(views, options))
-    todo = [_CameraFiles(folder, views.cameras[index], len(views), options) for index in range(len(views.cameras))]
-    tally = _Tally(len(views) * len(todo), progress)
+    count = len(views.cameras)
+    tally = _Tally(len(views) * count, progress)
     with one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
-        jobs = [pool.submit(_measure_camera, views, index, todo[index], options, tally) for index in range(len(todo))]
+        jobs = [pool.submit(_measure_camera, views, index, folder, options, tally) for index in range(count)]
         try:
             for job in as_completed(jobs):
                 job.result()
@@ -87,7 +88,12 @@ class _Tally:
             self._progress(self._done, self._total)
 
 
-def _measure_camera(views: Views, camera: int, files: _CameraFiles, options: MotionOptions, tally: _Tally) -> None:
+def _measure_camera(views: Views, camera: int, folder: Path, options: MotionOptions, tally: _Tally) -> None:
+    with closing(_CameraFiles(folder, views.cameras[camera], len(views), options)) as files:
+        _measure_steps(views, camera, files, options, tally)
+
+
+def _measure_steps(views: Views, camera: int, files: _CameraFiles, options: MotionOptions, tally: _Tally) -> None:
     available = np.flatnonzero(views.frames[:, camera] >= 0)
     start = files.finished
     tally.add(start)
@@ -157,24 +163,20 @@ class _CameraFiles:
             empty = np.full(instants, np.array((UNFINISHED, np.nan, np.nan, np.nan), dtype=STEP_RECORD))
             np.save(steps.with_suffix(".scratch.npy"), empty)
             os.replace(steps.with_suffix(".scratch.npy"), steps)
-        self._steps = np.lib.format.open_memmap(steps, mode="r+")
-        self._masks = np.lib.format.open_memmap(masks, mode="r+")
-        self._vectors = np.lib.format.open_memmap(vectors, mode="r+") if options.keep_flow else None
+        unfinished = np.flatnonzero(np.load(steps)["previous"] == UNFINISHED)
+        self.finished = int(unfinished[0]) if len(unfinished) else instants
+        """Instants measured when the files were opened, from the first on"""
+        self._steps, self._masks = _Rows(steps), _Rows(masks)
+        self._vectors = _Rows(vectors) if options.keep_flow else None
         self._pending: dict[int, tuple[int, float, float, float]] = {}
-
-    @property
-    def finished(self) -> int:
-        """Instants measured, from the first on."""
-        unfinished = np.flatnonzero(self._steps["previous"] == UNFINISHED)
-        return int(unfinished[0]) if len(unfinished) else len(self._steps)
 
     def skip(self, instant: int) -> None:
         self._add(instant, (NO_STEP, np.nan, np.nan, np.nan))
 
     def write(self, instant: int, previous: int, step: Step) -> None:
-        self._masks[instant] = np.packbits(step.mask, axis=1)
+        self._masks.write(instant, np.packbits(step.mask, axis=1))
         if self._vectors is not None:
-            self._vectors[instant] = step.optical_flow
+            self._vectors.write(instant, step.optical_flow)
         self._add(instant, (previous, step.magnitude, step.noise, float(step.mask.mean())))
 
     def _add(self, instant: int, record: tuple[int, float, float, float]) -> None:
@@ -188,9 +190,37 @@ class _CameraFiles:
             self._vectors.flush()
         self._masks.flush()
         for instant, record in self._pending.items():
-            self._steps[instant] = record
+            self._steps.write(instant, np.array(record, STEP_RECORD))
         self._steps.flush()
         self._pending.clear()
+
+    def close(self) -> None:
+        """Let go of the files; what is not committed is lost."""
+        for rows in (self._steps, self._masks, self._vectors):
+            if rows is not None:
+                rows.close()
+
+
+class _Rows:
+    """An .npy file that is written row by row. Not by mapping it into memory, where hours of optical flow would pile
+    up, and a full disk would end the process without a word."""
+
+    def __init__(self, path: Path) -> None:
+        header = np.load(path, mmap_mode="r")
+        self._dtype, self._offset, self._row_bytes = header.dtype, header.offset, header[:1].nbytes
+        self._file = path.open("r+b")
+
+    def write(self, row: int, values: np.ndarray) -> None:
+        self._file.seek(self._offset + row * self._row_bytes)
+        self._file.write(values.astype(self._dtype).tobytes())
+
+    def flush(self) -> None:
+        """Have the disk hold what was written."""
+        self._file.flush()
+        os.fdatasync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
 
 
 def _paths(folder: Path, camera: str) -> tuple[Path, Path, Path]:

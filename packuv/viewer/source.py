@@ -142,6 +142,7 @@ class SceneSource:
         self.segments = tuple(range(entry.first, entry.first + entry.frames) for entry in scene.index.segments)
         self._keys: OrderedDict[int, Codes] = OrderedDict()
         self._moving: OrderedDict[int, Codes] = OrderedDict()
+        self._rows = 0  # of all that is kept there
         self._last = -1  # frame at which the scene stands
 
     def key(self, segment: int) -> Codes:
@@ -169,11 +170,12 @@ class SceneSource:
         return codes
 
     def _keep(self, frame: int, codes: Codes) -> None:
+        before = self._moving.pop(frame, None)
         self._moving[frame] = Codes(codes.xyz.copy(), codes.attributes.copy())  # a view would keep all rows alive
-        self._moving.move_to_end(frame)
+        self._rows += len(codes) - (len(before) if before else 0)
         row_bytes = codes.xyz.itemsize * 3 + codes.attributes.shape[1]
-        while len(self._moving) > 1 and sum(map(len, self._moving.values())) * row_bytes > CACHE_BYTES:
-            self._moving.popitem(last=False)
+        while len(self._moving) > 1 and self._rows * row_bytes > CACHE_BYTES:
+            self._rows -= len(self._moving.popitem(last=False)[1])
 
 
 @contextmanager

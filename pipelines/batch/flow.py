@@ -4,8 +4,8 @@ the environment before."""
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from prefect.states import Cancelled, Completed, Failed
 
 from pipelines.batch.dashboard import BatchDashboard
 from pipelines.batch.plan import with_manifest
+from pipelines.batch.pool import opened_pool
 from pipelines.batch.request import BatchRequest
 from pipelines.batch.run import Batch, BatchEngine
 from pipelines.batch.summary import Summary
@@ -34,6 +35,7 @@ from tasks.artefacts.jobs import CancelledError, Jobs
 
 DatasetFlow = Flow[[BatchRequest], Summary]
 Ended = Callable[[Summary], object]
+Runner = Callable[[RunRequest, Journal, Jobs], Outcome]
 
 
 def dataset_flow(
@@ -87,8 +89,8 @@ def _process(request: BatchRequest, journal: Journal, link: Link, died: Callable
     try:
         link.post(lambda client: client.update_flow_run(run.id, tags=_tags(run, request)))
         dashboard = BatchDashboard(link, run.id, Path(request.manifest).stem)
-        with journal.heard_by(dashboard):
-            summary = batch.run(_engine(link, run, died, dashboard))
+        with _runner(request, journal, died) as runner, journal.heard_by(dashboard):
+            summary = batch.run(_engine(runner, link, run, dashboard))
         dashboard.summarize(summary.lines(), summary.page)
     except CancelledError as error:
         return Cancelled(message=str(error))
@@ -98,15 +100,25 @@ def _process(request: BatchRequest, journal: Journal, link: Link, died: Callable
     return Failed(message=summary.verdict) if summary.failed else Completed(message=summary.verdict)
 
 
-def _engine(link: Link, run: FlowRun, died: Callable[[], bool], dashboard: BatchDashboard) -> BatchEngine:
+@contextmanager
+def _runner(request: BatchRequest, journal: Journal, died: Callable[[], bool]) -> Iterator[Runner]:
+    """Who runs sequences: workers of a pool, or subflows here; raises ValueError for a pool without workers."""
+    if request.pool is not None:
+        with opened_pool(request.pool, journal.told) as pool:
+            yield pool.run
+        return
     starts = threading.Lock()
 
     def run_sequence(request: RunRequest, journal: Journal, jobs: Jobs) -> Outcome:
         return _run_sequence(request, journal, jobs, died, starts)
 
+    yield run_sequence
+
+
+def _engine(runner: Runner, link: Link, run: FlowRun, dashboard: BatchDashboard) -> BatchEngine:
     place = Place(PREFECT_API_URL.value() or "", str(run.id))
     return BatchEngine(
-        run=run_sequence,
+        run=runner,
         place=place,
         crashed=lambda old: set_crashed(link, old),
         cancelled=lambda: _is_cancelled(run),

@@ -52,7 +52,8 @@ class Headway(Forecast):
             rest.append(max(expected - seconds, (1 - MOST_SHARE) * expected))
             done += frames * min(seconds / expected, MOST_SHARE) if expected else 0.0
         later = self._pace.expected_seconds(sum(waiting))
-        self._left = None if later is None else max([(later + sum(rest)) / self._at_once, *rest])
+        at_once = len(rest) or self._at_once  # a pool may have taken fewer than are there for it
+        self._left = None if later is None else max([(later + sum(rest)) / at_once, *rest])
         return done
 
     def remaining_seconds(self) -> float | None:

@@ -45,7 +45,9 @@ class BatchRequest:
     memory_gb: float = 2.0
     """Of each job, for pictures and layers of the backdrop, 10^9 bytes; no result depends on it"""
     at_once: int | None = None
-    """Sequences at a time, which share the cores evenly; none: from cores and memory"""
+    """Sequences at a time, which share the cores evenly; none: from cores and memory, or all that a pool takes"""
+    pool: str | None = None
+    """Work pool whose workers take the sequences, each with all cores of its machine; none: this process does"""
     stop_after: LastStage = "report"
     """Last stage"""
     notify: str | None = None

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.process import CORES_PER_JOB, cores_of
+from pipelines.crew import CORES_PER_JOB
+from pipelines.process import cores_of
 
 BYTES_PER_SEQUENCE = 3_000_000_000
 """A fit with 80,000 Gaussians and its pictures takes 2.3 GB"""

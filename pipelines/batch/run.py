@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import packuv
@@ -42,6 +42,10 @@ MOST_NAMED = 3
 """Sequences under way that are named at a time"""
 
 
+class KilledError(RuntimeError):
+    """The process of a sequence was killed, as often as it was started."""
+
+
 @dataclass(frozen=True)
 class BatchEngine:
     """Who runs the sequences of a batch."""
@@ -64,7 +68,8 @@ class _Running:
 
     step: Step
     jobs: Jobs
-    began: float
+    began: float | None
+    """None while it waits for a worker to take it"""
     stages: dict[str, Forecast] = field(default_factory=dict)
 
     @property
@@ -82,13 +87,14 @@ class Batch:
         self._table = ResultTable(request.table)
         self._table.check()
         steps = self._plan.to_run
-        wide = request.at_once or default_at_once()
+        wide = request.at_once or (len(steps) if request.pool else default_at_once())
         self.at_once = min(wide, max(1, len(steps)))
         """Sequences at a time"""
         # With a time limit the cores decide what is fitted, so they must not depend on how many sequences are left.
-        self._cores = max(1, cores_of() // (self.at_once if request.max_minutes is None else wide))
+        shared = max(1, cores_of() // max(1, self.at_once if request.max_minutes is None else wide))
+        self._cores = None if request.pool else shared
         self._pace = Pace(_earlier(self._plan))
-        self._headway = Headway(time.monotonic(), self._pace, self.at_once)
+        self._headway = Headway(time.monotonic(), self._pace, 1 if request.pool else self.at_once)
         self._started = datetime.now(UTC)
         self._running: dict[str, _Running] = {}
         self._waiting = {step.name: step.frames for step in steps}
@@ -153,28 +159,30 @@ class Batch:
         with self._lock:
             if self._cancelled:
                 return
-            running = _Running(look_again(step), jobs_of(request), time.monotonic())
+            began = None if self._request.pool else time.monotonic()
+            running = _Running(look_again(step), jobs_of(request), began)
             self._running[step.name] = running
             del self._waiting[step.name]
             self._write_page()
-        started = datetime.now(UTC)
-        journal = Journal(_Ear(running, self._tell))
+        journal, made, told = Journal(_Ear(running, self._began, self._tell)), False, None
         try:
             outcome = engine.run(request, journal, running.jobs)
+            made = any(event.outcome == "made" and event.key for event in outcome.events)
             if request.stop_after == STAGES[-1]:
                 check_whole(outcome.folder)
             result = _finished(running.step, outcome)
+            told = outcome.figures["seconds"] if self._request.pool else None  # a batch may join in late
         except Exception as error:
             result = _ended(step, error)
-        now, seconds = datetime.now(UTC), time.monotonic() - running.began
-        made = any(event.outcome == "made" and event.key for event in journal.events)
+        now, begun = datetime.now(UTC), time.monotonic() if running.began is None else running.began
+        seconds = time.monotonic() - begun if told is None else told
         hours = seconds / 3600 if made or step.earlier is None else step.earlier.hours
         self._note(
             replace(
                 result,
                 seconds=round(seconds, 3),
                 hours=hours if result.status is Status.FINISHED else None,
-                started=started.isoformat(timespec="seconds"),
+                started=(now - timedelta(seconds=seconds)).isoformat(timespec="seconds"),
                 finished=now.isoformat(timespec="seconds"),
             ),
             step.frames if made else 0,
@@ -217,17 +225,29 @@ class Batch:
             if not at_once and now - self._told < TELL_SECONDS:
                 return
             self._told = now
-            running = [(now - one.began, one.step.frames) for one in self._running.values()]
-            done = self._headway.look(self._waiting.values(), running)
+            under_way = self._running.values()
+            running = [(now - one.began, one.step.frames) for one in under_way if one.began is not None]
+            waiting = [*self._waiting.values(), *(one.step.frames for one in under_way if one.began is None)]
+            done = self._headway.look(waiting, running)
             frames = sum(step.frames for step in self._plan.to_run)
-            left = sum(self._waiting.values()) + sum(count for _, count in running)
+            left = sum(waiting) + sum(count for _, count in running)
             self._journal.moved(LABEL, frames - left + done, frames, self._words())
 
     def _words(self) -> str:
-        doing = [one.doing for one in self._running.values()]
+        doing = [one.doing for one in self._running.values() if one.began is not None]
         more = f" and {len(doing) - MOST_NAMED} more" if len(doing) > MOST_NAMED else ""
-        ended = f"{len(self._results)} of {len(self._plan.steps)} sequences"
-        return f"{ended}, {len(doing)} running: {', '.join(doing[:MOST_NAMED])}{more}" if doing else ended
+        parts = [f"{len(self._results)} of {len(self._plan.steps)} sequences"]
+        if doing:
+            parts.append(f"{len(doing)} running: {', '.join(doing[:MOST_NAMED])}{more}")
+        if left := len(self._running) - len(doing):
+            parts.append(f"{left} handed out")
+        return ", ".join(parts)
+
+    def _began(self, running: _Running) -> None:
+        """A worker took the sequence."""
+        with self._lock:
+            running.began = time.monotonic()
+            self._write_page()
 
     def _known(self) -> list[Result]:
         """Results of this batch, in the order of the manifest."""
@@ -239,8 +259,9 @@ class Batch:
 
     def _write_page(self) -> None:
         lines = [_line(result, self._request) for result in [*self._known(), *self._plan.others]]
-        lines += [Line(name, "running") for name in self._running]
-        lines += [Line(name, "waiting") for name in self._waiting]
+        waiting = [*(name for name, one in self._running.items() if one.began is None), *self._waiting]
+        lines += [Line(name, "running") for name in self._running if name not in waiting]
+        lines += [Line(name, "waiting") for name in waiting]
         manifest = Path(self._request.manifest)
         text = page_text(
             manifest.stem,
@@ -293,11 +314,13 @@ def run_directly(request: BatchRequest, journal: Journal) -> Summary:
 class _Ear:
     """A `pipelines.events.Audience` of one sequence."""
 
-    def __init__(self, running: _Running, tell: Callable[[], None]) -> None:
-        self._running, self._tell = running, tell
+    def __init__(self, running: _Running, took: Callable[[_Running], None], tell: Callable[[], None]) -> None:
+        self._running, self._took, self._tell = running, took, tell
 
     def began(self, label: str, forecast: Forecast) -> None:
         self._running.stages[label] = forecast
+        if self._running.began is None:
+            self._took(self._running)
         self._tell()
 
     def moved(self, label: str, forecast: Forecast) -> None:
@@ -334,6 +357,8 @@ def _ended(step: Step, error: Exception) -> Result:
     status = Status.BAD_INPUT if isinstance(error, BAD_INPUT) else Status.FAILED
     if isinstance(error, CancelledError):
         status = Status.CANCELLED
+    if isinstance(error, KilledError):
+        status = Status.KILLED
     return _row(step, status, str(error) or type(error).__name__)
 
 

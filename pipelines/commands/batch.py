@@ -20,7 +20,7 @@ from pipelines.commands.progress import TerminalProgress
 from pipelines.commands.run import asked_for
 from pipelines.commands.terminal import print_table
 from pipelines.events import Journal
-from pipelines.server import workflow_server
+from pipelines.server import Server, brings_server, workflow_server
 
 if TYPE_CHECKING:
     from pipelines.batch.plan import Step
@@ -51,6 +51,7 @@ def request_from(arguments: argparse.Namespace) -> BatchRequest:
         tags=arguments.tags,
         jobs=arguments.jobs,
         at_once=arguments.at_once,
+        pool=arguments.pool,
         stop_after=arguments.stop_after,
         notify=arguments.notify,
         **asked_for(arguments),
@@ -62,19 +63,41 @@ def run(request: BatchRequest, journal: Journal, *, direct: bool) -> Summary:
     from pipelines.batch.plan import plan_batch, with_manifest  # takes seconds, which a misspelt option need not wait
     from pipelines.batch.run import run_directly
 
+    if direct and request.pool:
+        raise ValueError("workers of a pool need the workflow engine; leave out --direct or --pool")
     request = with_manifest(request)
     if direct or not plan_batch(request).to_run:  # no engine for nothing
         return run_directly(request, journal)
+    if request.pool and brings_server(Path(request.out)):
+        stays = f"name it in PREFECT_API_URL, or have packuv serve --out {request.out} running"
+        raise ValueError(f"workers of the pool {request.pool} need a server that stays; {stays}")
     with workflow_server(Path(request.out)) as server:
         journal.started("workflow engine")
         from pipelines.batch.flow import run_flow
         from pipelines.sequence import log_to_the_server_only
 
-        server.wait_ready()
+        _check(server, request.pool)
         journal.ended("workflow engine")
         journal.told("dashboard", server.dashboard)
         log_to_the_server_only()
         return run_flow(request, journal, server.died)
+
+
+def _check(server: Server, pool: str | None) -> None:
+    """Raise ValueError for a pool that would take nothing, also where its server does not answer."""
+    if pool is None:
+        server.wait_ready()
+        return
+    from prefect.client.orchestration import get_client
+
+    from pipelines.batch.pool import check_pool
+
+    try:
+        server.wait_ready()
+    except RuntimeError as error:
+        raise ValueError(str(error)) from None
+    with get_client(sync_client=True) as client:
+        check_pool(client, pool)
 
 
 def _tell(request: BatchRequest, *, as_json: bool) -> int:

@@ -49,6 +49,7 @@ def request_from(arguments: argparse.Namespace) -> RunRequest:
         hold_out=arguments.hold_out,
         stop_after=arguments.stop_after if arguments.command == "run" else arguments.command,
         jobs=arguments.jobs,
+        cluster=arguments.cluster,
         **asked_for(arguments),
     )
 
@@ -86,7 +87,12 @@ def run(request: RunRequest, journal: Journal, *, direct: bool) -> Outcome:
 
 
 def _came_to_its_end(request: RunRequest) -> bool:
-    """Whether the last run into one of the folders was this one, and finished; cost: reading a small file for each."""
+    """Whether the last run into one of the folders was this one, and finished; cost: reading a small file for each.
+
+    False with a cluster, whose workers decide on what is made.
+    """
+    if request.cluster:
+        return False
     for path in Path(request.out).glob("*/run.json"):
         with contextlib.suppress(OSError, ValueError, KeyError):  # of another version
             last = json.loads(path.read_text())

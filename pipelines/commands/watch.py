@@ -10,7 +10,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import time
 import urllib.error
 import urllib.request
@@ -173,7 +172,7 @@ def _ask_to_end(runs: Sequence[Found]) -> None:
     """The engine is told, so that its dashboard says Cancelled; the process is, once, in case there is no engine."""
     records = [run.record for run in runs]
     untold = [one for one in records if not (one.engine and _set_state(one.engine, "CANCELLING", "Cancelling"))]
-    for pid in {one.pid for one in untold if one.host == socket.gethostname()}:
+    for pid in {one.pid for one in untold if one.here}:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGTERM)
 
@@ -182,7 +181,7 @@ def _wait_for(run: Found, *, kill: bool) -> str:
     """How the run ended; empty if it goes on."""
     if _ends_within(run, ENDING_SECONDS):
         return "cancelled"
-    if kill and run.record.host == socket.gethostname():
+    if kill and run.record.here:
         with contextlib.suppress(ProcessLookupError):
             os.kill(run.record.pid, signal.SIGKILL)
         if _ends_within(run, ENDING_SECONDS):

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from sync.timecode.digits import parse_decimals
-from sync.timecode.labels import is_label, read_labels
-from sync.timecode.series import Timecodes, counted_from_first
+from sync.timecode.labels import day_of, is_clock, is_label, read_clocks, read_labels
+from sync.timecode.series import DAY_NS, Timecodes, counted_from_first, unwrapped, wrap_notes
 from sync.timecode.tables import Table, plain
 from sync.tree import TIME_LIMIT_NS
 
@@ -22,13 +24,25 @@ UNIT_POWERS = {"ns": 0, "us": 3, "ms": 6, "s": 9}
 INDEX_COLUMNS = ("frame_number", "frame_index", "frame_id", "frame_no", "frame_num", "frame", "index", "idx")
 TIME_WORDS = {"time", "timestamp", "timestamps", "timecode", "ts", "pts", "epoch"}
 
+SOME = 1000
+"""Rows that tell of all"""
+FEWEST_ROWS = 4
+"""From which on a last line can be held against the others"""
+STALL = 1000.0
+"""Usual gaps that may lie before a last line"""
+NEAR = 2.0
+"""Factor either way by which times may be further apart than the frames of the video: cameras drop frames"""
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)([.,]\d{1,12})?\s*(Z|[+-]\d\d:?\d\d)?")
+
 _UNIT = re.compile(
     r"(?:^|_)(?:(ns|nsecs?|nanos|nanoseconds?)|(us|usecs?|micros|microseconds?)|(ms|msecs?|millis|milliseconds?)"
     r"|(s|secs?|seconds?))$"
 )
 
 
-def table_timecodes(table: Table, rows: np.ndarray | None, rate: Fraction | None, column: str | None) -> Timecodes:
+def table_timecodes(
+    table: Table, rows: np.ndarray | None, rate: Fraction | None, column: str | None, period_ns: int | None = None
+) -> Timecodes:
     """Timecodes of the given rows; None means all, in file order.
 
     Rows of a table for several cameras come in any order (caliscope writes them as they arrive): they are put in
@@ -37,17 +51,52 @@ def table_timecodes(table: Table, rows: np.ndarray | None, rate: Fraction | None
     time = _time_column(table, column)
     index = next((name for word in INDEX_COLUMNS for name in table.columns if plain(name) == word), None)
     chosen = np.arange(len(table.columns[time])) if rows is None else rows
-    times = _times(table, time, chosen, rate)
+    read = _times(table, time, chosen, rate, period_ns)
+    times = read.times_ns
+    _check_last(table, time, times)
     indices = _numbers(table, index, chosen, 0, integer=True) if index else None
     if rows is not None:
         unique = indices is not None and len(np.unique(indices)) == len(indices)
         order = np.argsort(times if indices is None or not unique else indices, kind="stable")
         times = times[order]
         indices = None if indices is None else indices[order]
-    return Timecodes(times, counted_from_first(np.arange(len(times)) if indices is None else indices))
+    cycle, notes = read.cycle_ns, read.notes
+    if read.unit_ns:
+        times, cycle, wraps = unwrapped(times, read.unit_ns)
+        notes += wrap_notes(wraps, cycle)
+    numbers = counted_from_first(np.arange(len(times)) if indices is None else indices)
+    return Timecodes(times, numbers, cycle, notes=notes)
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A column of times as it stands in the file."""
+
+    times_ns: np.ndarray
+    unit_ns: int = 0
+    """Of its numbers; 0 where they are no counter"""
+    cycle_ns: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def _check_last(table: Table, name: str, times: np.ndarray) -> None:
+    """Refuse a last line that lost its end and some of its digits with it."""
+    values = table.columns[name]
+    if table.whole or len(values) < FEWEST_ROWS or len(times) != len(values):
+        return
+    steps = np.diff(times)
+    usual = float(np.median(np.abs(steps[:-1])))
+    lost = len(values[-1].as_py()) < len(values[-2].as_py())
+    if lost and not 0 < steps[-1] <= STALL * max(usual, 1.0):
+        raise ValueError(
+            f"{table.place(len(values) - 1)}: the last line is cut short: it has no end, and its time does not go on "
+            "from the one before; copy the file again, or remove that line and the video's last frame"
+        )
 
 
 def _time_column(table: Table, column: str | None) -> str:
+    if not table.named:  # and so the time was chosen
+        return next(iter(table.columns))
     if column is not None:
         if column not in table.columns:
             raise ValueError(f"{table.path} has no column {column!r}; it has {list(table.columns)}")
@@ -62,30 +111,85 @@ def _time_column(table: Table, column: str | None) -> str:
     return fits[0]
 
 
-def _times(table: Table, name: str, rows: np.ndarray, rate: Fraction | None) -> np.ndarray:
+def _times(table: Table, name: str, rows: np.ndarray, rate: Fraction | None, period_ns: int | None) -> _Read:
     values = table.columns[name].take(pa.array(rows))
     first = values[0].as_py()
     if is_label(first):
-        return read_labels(values.to_pylist(), rate, lambda row: table.place(int(rows[row])))
-    return _numbers(table, name, rows, UNIT_POWERS[_unit(table.path, name, values, first)])
+        times = read_labels(values.to_pylist(), rate, lambda row: table.place(int(rows[row])))
+        assert rate is not None
+        return _Read(times, cycle_ns=day_of(first, rate))
+    if is_clock(first):
+        return _Read(read_clocks(values.to_pylist(), lambda row: table.place(int(rows[row]))), cycle_ns=DAY_NS)
+    if _ISO.fullmatch(first):
+        return _Read(_calendar(table, rows, values.to_pylist()))
+    unit, notes = _unit(table, name, rows, values, first, period_ns)
+    power = UNIT_POWERS[unit]
+    return _Read(_numbers(table, name, rows, power), 10**power, notes=notes)
 
 
-def _unit(path: Path, name: str, values: pa.StringArray, first: str) -> str:
-    """Unit of a column: said by its name, else decimals are seconds, else the size of an epoch time tells."""
+def _calendar(table: Table, rows: np.ndarray, values: Sequence[str]) -> np.ndarray:
+    """ISO 8601 dates with times to ns since 1970, int64 [n]; without a zone they are taken for UTC."""
+    found = np.empty(len(values), np.int64)
+    for row, value in enumerate(values):
+        match = _ISO.fullmatch(value)
+        try:
+            if match is None:
+                raise ValueError
+            moment = datetime.fromisoformat(f"{match[1]}T{match[2]}{match[4] or '+00:00'}".replace("Z", "+00:00"))
+        except ValueError:
+            raise ValueError(
+                f"{table.place(int(rows[row]))}: expected a date and time as 2026-11-28T12:34:56.789, got {value!r}"
+            ) from None
+        part = int(((match[3] or "")[1:] + "0" * 9)[:9])
+        since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+        found[row] = (since.days * 86_400 + since.seconds) * 1_000_000_000 + part
+    return found
+
+
+def _unit(
+    table: Table, name: str, rows: np.ndarray, values: pa.StringArray, first: str, period_ns: int | None
+) -> tuple[str, tuple[str, ...]]:
+    """Unit of a column, and what to say of it: its name tells, else the video's frame rate, else decimals are seconds,
+    else the size of an epoch time tells."""
     named = _UNIT.search(plain(name))
     if named is not None:
-        return tuple(UNIT_POWERS)[next(group for group in range(4) if named[group + 1])]
-    if plain(name) == "frame_time" or pc.any(pc.match_substring(values, ".")).as_py():
+        return tuple(UNIT_POWERS)[next(group for group in range(4) if named[group + 1])], ()
+    usual = _usual_unit(name, values, first)
+    fitting = _fitting_units(table, name, rows[:SOME], period_ns)
+    if len(fitting) == 1 and fitting[0] != usual:
+        assert period_ns is not None
+        note = f"its times are taken for {fitting[0]}, since its video has a frame every {period_ns / 1e6:.4g} ms"
+        return fitting[0], (note,) if usual else ()
+    if usual is None:
+        raise ValueError(f"{table.path}: the unit of column {name!r} is open; rename it to {name}_ns, _us, _ms or _s")
+    return usual, ()
+
+
+def _usual_unit(name: str, values: pa.StringArray, first: str) -> str | None:
+    """By what such numbers mostly are; None where they may be anything."""
+    if plain(name) == "frame_time" or pc.any(pc.match_substring_regex(values, "[.,]")).as_py():
         return "s"
     digits = len(first.lstrip("+-0")) if first.lstrip("+-").isdecimal() else 0
-    if digits not in (10, 13, 16, 19):
-        raise ValueError(f"{path}: the unit of column {name!r} is open; rename it to {name}_ns, _us, _ms or _s")
-    return {10: "s", 13: "ms", 16: "us", 19: "ns"}[digits]
+    return {10: "s", 13: "ms", 16: "us", 19: "ns"}.get(digits)
+
+
+def _fitting_units(table: Table, name: str, rows: np.ndarray, period_ns: int | None) -> list[str]:
+    """Units in which the numbers are about as far apart as the frames of the video."""
+    if not period_ns:
+        return []
+    try:  # as floats, whose last digits no unit depends on
+        values = np.array(_with_points(table.columns[name].take(pa.array(rows))).to_pylist(), np.float64)
+    except ValueError:
+        return []
+    steps = np.abs(np.diff(values))
+    gap = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    found = {unit: gap * 10.0**power for unit, power in UNIT_POWERS.items()}
+    return [unit for unit, step in found.items() if period_ns / NEAR <= step <= period_ns * NEAR]
 
 
 def _numbers(table: Table, name: str, rows: np.ndarray, power: int, *, integer: bool = False) -> np.ndarray:
     """Column of decimal text times 10 to `power`, int64 [len(rows)]; digits beyond are rounded half away from 0."""
-    values = table.columns[name].take(pa.array(rows))
+    values = _with_points(table.columns[name].take(pa.array(rows)))
     _, offsets, data = values.buffers()
     ends = np.frombuffer(offsets, np.int32)[: len(values) + 1]
     text = np.frombuffer(data, np.uint8) if data is not None and data.size else np.zeros(1, np.uint8)
@@ -97,3 +201,11 @@ def _numbers(table: Table, name: str, rows: np.ndarray, power: int, *, integer: 
             f"{table.place(int(rows[good]))}: expected {wanted} in column {name!r}, got {values[good].as_py()!r}"
         )
     return out
+
+
+def _with_points(values: pa.StringArray) -> pa.StringArray:
+    """Decimal commas as points; a column that has both is left as it is."""
+    some = values.slice(0, SOME)
+    if pc.any(pc.match_substring(some, ",")).as_py() and not pc.any(pc.match_substring(some, ".")).as_py():
+        return pc.replace_substring(values, ",", ".")
+    return values

@@ -102,7 +102,7 @@ def _exponent(data: np.ndarray, at: int, end: int) -> tuple[int, bool]:
     sign = -1 if at < end and data[at] == 45 else 1
     if at < end and (data[at] == 45 or data[at] == 43):
         at += 1
-    value, count, stop = _digits(data, at, 3)
+    value, count, stop = _digits(data, at, min(3, end - at))  # not into the number that follows
     return sign * value, count > 0 and stop == end
 
 

@@ -8,14 +8,35 @@ from fractions import Fraction
 
 import numpy as np
 
-from sync.timecode.rates import frames_to_ns
+from sync.timecode.rates import NANOSECONDS, frames_to_ns
 
+_CLOCK = re.compile(r"(\d\d):([0-5]\d):([0-5]\d)[.,](\d{3,12})")
 _LABEL = re.compile(r"(\d\d):([0-5]\d):([0-5]\d)([:;.,])(\d{2,3})")
 
 
 def is_label(text: str) -> bool:
     """Whether a text has the form of a label; the rate decides whether there is such a label."""
-    return _LABEL.fullmatch(text) is not None
+    return _LABEL.fullmatch(text) is not None and not is_clock(text)
+
+
+def is_clock(text: str) -> bool:
+    """Whether a text is a time of day with decimals of a second, three or more, and so no label."""
+    return _CLOCK.fullmatch(text) is not None
+
+
+def read_clocks(texts: Sequence[str], place: Callable[[int], str]) -> np.ndarray:
+    """Times of day HH:MM:SS.fff in the order of recording to ns since midnight, over any midnights; int64 [n]."""
+    found = np.empty(len(texts), np.int64)
+    for row, text in enumerate(texts):
+        match = _CLOCK.fullmatch(text.strip())
+        if match is None or int(match[1]) > 23:
+            raise ValueError(f"{place(row)}: expected a time of day as 12:34:56.789, got {text[:80]!r}")
+        seconds = (int(match[1]) * 60 + int(match[2])) * 60 + int(match[3])
+        found[row] = seconds * NANOSECONDS + int((match[4] + "0" * 9)[:9])
+    day = 86_400 * NANOSECONDS
+    steps = np.diff(found, prepend=found[:1])
+    found += day * np.cumsum((steps < -(day // 2)).astype(np.int64) - (steps > day // 2))
+    return found
 
 
 def label_to_frame(label: str, rate: Fraction) -> int:
@@ -84,6 +105,11 @@ def labels_to_ns(labels: Sequence[str], rate: Fraction) -> np.ndarray:
     steps = np.diff(frames, prepend=frames[:1])
     frames += day * np.cumsum((steps < -(day // 2)).astype(np.int64) - (steps > day // 2))
     return frames_to_ns(frames, rate)
+
+
+def day_of(label: str, rate: Fraction) -> int:
+    """Nanoseconds after which labels like this one start over."""
+    return int(frames_to_ns(np.array([frames_per_day(rate, drop_frame=":" not in label.strip()[8:9])]), rate)[0])
 
 
 def read_labels(labels: Sequence[str], rate: Fraction | None, place: Callable[[int], str]) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,51 +13,85 @@ from sync.timecode.columns import table_timecodes
 from sync.timecode.lines import read_lines
 from sync.timecode.rates import NANOSECONDS
 from sync.timecode.series import Timecodes
-from sync.timecode.tables import CAMERA_COLUMNS, Table, csv_table, json_table
+from sync.timecode.tables import CAMERA_COLUMNS, Table, csv_table, json_table, npy_table, number_table
 
 FASTEST_GAP_NS, SLOWEST_GAP_NS = 10_000, 3600 * NANOSECONDS
 """No camera of a rig films faster than 100,000 or slower than one frame an hour: beyond, the unit is misread."""
 
 
+SUFFIXES = (".csv", ".tsv", ".txt", ".log", ".json", ".npy")
+"""Of files with timecodes"""
+
+
 def read_timecodes(
-    path: Path, *, camera: str | None = None, rate: Fraction | None = None, column: str | None = None
+    path: Path,
+    *,
+    camera: str | None = None,
+    rate: Fraction | None = None,
+    column: str | None = None,
+    period_ns: int | None = None,
 ) -> Timecodes:
-    """Read one camera's timecodes from a .txt, .csv or .json file.
+    """Read one camera's timecodes from a file with one of `SUFFIXES`.
 
     Args:
         path: the file; docs/capture-folder.md describes the formats.
         camera: whose rows to take from a table that holds several cameras.
         rate: frames per second, needed for SMPTE labels only.
-        column: name of the time column, where a table has more than one.
+        column: name of the time column, where a table has more than one; its number, from 1, where it has no header.
+        period_ns: time between two frames of the video, by which the unit is told where nothing names it.
 
     Raises:
         FileNotFoundError: no such file.
         ValueError: a line that does not parse, with file, number and content; a table that leaves a choice open.
     """
-    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
-    if not data.strip():
-        raise ValueError(f"{path} is empty; a camera needs at least one timecode")
+    data = read_text_bytes(path)
     kind = path.suffix.lower()
-    if kind == ".txt":
-        timecodes = read_lines(path, data, rate)
-    elif kind in (".csv", ".json"):
-        table = csv_table(path, data) if kind == ".csv" else json_table(path, data)
-        timecodes = table_timecodes(table, _rows_of(table, camera), rate, column)
-    else:
-        raise ValueError(f"timecodes are read from .txt, .csv or .json, but {path.name!r} is none of these")
+    if kind not in SUFFIXES:
+        raise ValueError(f"timecodes are read from {_either(SUFFIXES)}, but {path.name!r} is none of these")
+    timecodes = read_lines(path, data, rate) if kind in (".txt", ".log") else None
+    if timecodes is None:
+        table = _table(path, kind, data, column)
+        timecodes = table_timecodes(table, _rows_of(table, camera), rate, column, period_ns)
     _check_gaps(path, timecodes)
     return timecodes
 
 
+def _table(path: Path, kind: str, data: bytes, column: str | None) -> Table:
+    match kind:
+        case ".json":
+            return json_table(path, data, column)
+        case ".npy":
+            return npy_table(path, data)
+        case ".txt" | ".log":
+            return number_table(path, data, column)
+    return csv_table(path, data, column)
+
+
+def read_text_bytes(path: Path) -> bytes:
+    """What a file holds, text in UTF-16 and marks of byte order made plain UTF-8; raises ValueError if it is empty."""
+    data = path.read_bytes()
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        data = data.decode("utf-16", errors="replace").encode()
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if not data.strip():
+        raise ValueError(f"{path} is empty; a camera needs at least one timecode")
+    return data
+
+
 def read_shared_timecodes(
-    path: Path, cameras: Sequence[str], *, rate: Fraction | None = None, column: str | None = None
+    path: Path,
+    cameras: Sequence[str],
+    *,
+    rate: Fraction | None = None,
+    column: str | None = None,
+    period_ns: Mapping[str, int] | None = None,
 ) -> dict[str, Timecodes]:
     """Read the timecodes of several cameras from the one CSV table that they share.
 
     Raises:
         ValueError: as `read_timecodes`, or two cameras would take the same rows.
     """
-    table = csv_table(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"))
+    table, periods = csv_table(path, read_text_bytes(path)), period_ns or {}
     if table.camera is None:
         raise ValueError(f"{path} is shared by all cameras, so one of its columns must be {_either(CAMERA_COLUMNS)}")
     ids = table.cameras
@@ -66,7 +100,10 @@ def read_shared_timecodes(
         twins = [other for other in cameras if chosen[other] == name]
         if len(twins) > 1:
             raise ValueError(f"{path}: rows of {name!r} would serve cameras {twins}; give the rows the videos' names")
-    found = {camera: table_timecodes(table, table.rows_of(name), rate, column) for camera, name in chosen.items()}
+    found = {
+        camera: table_timecodes(table, table.rows_of(name), rate, column, periods.get(camera))
+        for camera, name in chosen.items()
+    }
     for timecodes in found.values():
         _check_gaps(path, timecodes)
     return found

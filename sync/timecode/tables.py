@@ -1,11 +1,13 @@
-"""CSV and JSON files as columns of text."""
+"""Tables of all kinds as columns of text: CSV with a header and without, plain numbers, JSON, NumPy's arrays."""
 
 from __future__ import annotations
 
+import io
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,12 @@ import pyarrow.csv as pcsv
 
 CAMERA_COLUMNS = ("cam_id", "camera_id", "camera", "camera_name", "cam", "port")
 NANOSECOND_LIST = "timestamp_ns"
-"""Column name that a bare JSON list of numbers is given."""
+"""Column name that a bare JSON list of whole numbers is given."""
+TIME_COLUMN, INDEX_COLUMN = "timestamp", "frame"
+"""Column names where a file names none"""
+COMMENT = b"#"
+VERSION_2 = re.compile(rb"#\s*time(?:code|stamp) format v2", re.IGNORECASE)
+"""First line of a file of milliseconds, as mkvmerge and VirtualDub write and read them"""
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,10 @@ class Table:
     columns: Mapping[str, pa.StringArray]
     lines: Sequence[bytes] | None
     """The file's lines, for messages; None for JSON"""
+    named: bool = True
+    """Whether the file names its columns; without names the first one here is the time"""
+    whole: bool = True
+    """Whether the last line has its end; a file that was cut short has not"""
 
     @property
     def camera(self) -> str | None:
@@ -48,17 +59,17 @@ class Table:
         """Where row `row` stands, for people."""
         if self.lines is None:
             return f"{self.path}, item {row}"
-        filled = [number for number, line in enumerate(self.lines, start=1) if line.strip()]
-        number = filled[row + 1]
+        filled = [number for number, line in enumerate(self.lines, start=1) if _is_filled(line)]
+        number = filled[row + self.named]
         return f"{self.path}, line {number} ({self.lines[number - 1].decode(errors='replace').strip()[:80]!r})"
 
 
-def csv_table(path: Path, data: bytes) -> Table:
-    """A table with a header, separated by comma, semicolon or tab."""
+def csv_table(path: Path, data: bytes, column: str | None = None) -> Table:
+    """A table with a header, separated by comma, semicolon or tab; without a header, as `number_table`."""
     lines = data.splitlines()
     header = lines[0].decode(errors="replace") if lines else ""
-    if not re.search("[A-Za-z]", header):
-        raise ValueError(f"{path}: the first line must name the columns, but is {header[:80]!r}")
+    if not re.search("[A-Za-z]", header) or header.startswith("#") or _ISO_START.match(header):
+        return number_table(path, data, column)
     delimiter = max(",;\t", key=header.count)
     names = [name.strip().strip('"') for name in header.split(delimiter)]
     if len(set(names)) < len(names):
@@ -78,20 +89,76 @@ def csv_table(path: Path, data: bytes) -> Table:
     if len(table) == 0:
         raise ValueError(f"{path} has a header but no rows; a camera needs at least one timecode")
     columns = {name: pc.utf8_trim_whitespace(pa.concat_arrays(table[name].chunks)) for name in names}
-    return Table(path, columns, lines)
+    return Table(path, columns, lines, whole=data.endswith((b"\n", b"\r")))
 
 
-def json_table(path: Path, data: bytes) -> Table:
-    """A list of numbers (ns) or labels, or a list of objects; numbers stay text on the way in."""
+def number_table(path: Path, data: bytes, column: str | None = None) -> Table:
+    """Lines of values without a header, comments aside: times alone, a counted index and times, or times and whatever
+    follows, as in TUM's trajectories. Where that leaves a choice, `column` is the number of the time's, from 1.
+
+    Raises ValueError for a choice that is left open, or a line with fewer columns than the first.
+    """
+    lines = data.splitlines()
+    rows = [line.decode(errors="replace").strip() for line in lines if _is_filled(line)]
+    if not rows:
+        raise ValueError(f"{path} holds no line with a time; a camera needs at least one timecode")
+    split = _splitter(rows)
+    cells = [split(row) for row in rows]
+    wide = len(cells[0])
+    whole = data.endswith((b"\n", b"\r"))
+    short = next((row for row, cell in enumerate(cells) if len(cell) < wide), None)
+    table = Table(path, {}, lines, named=False, whole=whole)
+    if short is not None:
+        raise ValueError(f"{table.place(short)}: expected {wide} columns as in the first line, got {len(cells[short])}")
+    counted = wide > 1 and [cell[0] for cell in cells[:3]] in (["0", "1", "2"], ["1", "2", "3"])
+    place = _column_number(path, column, wide) if column is not None else int(counted)
+    if column is None and wide > 1 and not counted and path.suffix.lower() in (".csv", ".tsv"):
+        raise ValueError(
+            f"{path} has {wide} columns and no header; say which holds the time in capture.toml: timecode_column = '1' "
+            "for the first, or give it a first line with names"
+        )
+    version_2 = bool(VERSION_2.match(data))
+    name = f"{TIME_COLUMN}_ms" if version_2 else TIME_COLUMN
+    columns = {name: pa.array([cell[place] for cell in cells], pa.string())}
+    if counted and place:
+        columns[INDEX_COLUMN] = pa.array([cell[0] for cell in cells], pa.string())
+    return Table(path, columns, lines, named=False, whole=whole)
+
+
+def npy_table(path: Path, data: bytes) -> Table:
+    """An array [n] of numbers, as `numpy.save` writes it; floats by their shortest text."""
+    try:
+        values = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"{path} is no array that numpy can load: {error}") from None
+    if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "iufM" or not len(values):
+        shape = getattr(values, "shape", "no array")
+        raise ValueError(f"{path} must hold an array [n] of times, one or more, but holds {shape}")
+    if values.dtype.kind == "M":
+        values = values.astype("datetime64[ns]").astype(np.int64)
+        return Table(path, {NANOSECOND_LIST: pa.array([str(value) for value in values], pa.string())}, None)
+    text = [str(value) for value in values.tolist()]
+    if values.dtype.kind == "f":
+        text = [value if "." in value or "e" in value else f"{value}.0" for value in text]
+    return Table(path, {TIME_COLUMN: pa.array(text, pa.string())}, None)
+
+
+def json_table(path: Path, data: bytes, column: str | None = None) -> Table:
+    """A list of whole numbers (ns), other times or labels, of objects, or of lists, or an object of lists; numbers stay
+    text on the way in."""
     try:
         items = json.loads(data, parse_int=str, parse_float=str, parse_constant=str)
     except ValueError as error:
         raise ValueError(f"{path} is no JSON: {error}") from None
+    if isinstance(items, dict):  # of columns
+        items = _transposed(path, items)
     if not isinstance(items, list) or not items:
-        raise ValueError(f"{path} must hold a list of nanoseconds or of objects, with at least one item")
+        raise ValueError(f"{path} must hold a list of nanoseconds, of objects or of lists, with at least one item")
+    if isinstance(items[0], list):
+        rows = "\n".join("\t".join(str(cell) for cell in item) if isinstance(item, list) else "" for item in items)
+        return number_table(path.with_suffix(".json"), rows.encode() + b"\n", column)
     if not isinstance(items[0], dict):
-        name = "timecode" if isinstance(items[0], str) and ":" in items[0] else NANOSECOND_LIST
-        items = [{name: item} for item in items]
+        items = [{_list_name(items): item} for item in items]
     columns: dict[str, list[str]] = {name: [] for name in items[0]}
     for number, item in enumerate(items):
         for name, values in columns.items():
@@ -99,10 +166,65 @@ def json_table(path: Path, data: bytes) -> Table:
     return Table(path, {name: pa.array(values, pa.string()) for name, values in columns.items()}, None)
 
 
+def _transposed(path: Path, columns: Mapping[str, Any]) -> list[dict[str, Any]]:
+    lists = {name: values for name, values in columns.items() if isinstance(values, list)}
+    if not lists or len({len(values) for values in lists.values()}) != 1:
+        raise ValueError(
+            f"{path} must hold a list, or lists of one length, one a column, but holds {list(columns)[:8]}"
+        )
+    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+
+
+def _list_name(items: Sequence[Any]) -> str:
+    """Of the column that a bare list is."""
+    text = [item for item in items if isinstance(item, str)]
+    if text and ":" in text[0]:
+        return "timecode"
+    decimal = any("." in item or "-" in item[1:] for item in text)  # or a date
+    return TIME_COLUMN if decimal else NANOSECOND_LIST
+
+
+def _is_filled(line: bytes) -> bool:
+    """Whether a line holds values."""
+    return bool(line.strip()) and not line.lstrip().startswith(COMMENT)
+
+
+def _splitter(rows: Sequence[str]) -> Callable[[str], list[str]]:
+    """How lines fall into columns: by semicolon, tab or comma, else by space. A single comma a line, before which the
+    number stays the same here and there, is a decimal one."""
+    first = rows[0]
+    for delimiter in (";", "\t"):
+        if delimiter in first:
+            return lambda row: [cell.strip() for cell in row.split(delimiter)]
+    if "," in first and not _has_decimal_comma(rows):
+        return lambda row: [cell.strip() for cell in row.split(",")]
+    if _ISO_START.match(first):
+        return lambda row: [row]
+    return str.split
+
+
+def _has_decimal_comma(rows: Sequence[str]) -> bool:
+    parts = [row.split(",") for row in rows[:1000]]
+    if any(len(part) != 2 or not part[0].lstrip("+-").isdecimal() or not part[1].isdecimal() for part in parts):
+        return False
+    return any(before[0] == after[0] for before, after in pairwise(parts))
+
+
+def _column_number(path: Path, column: str, wide: int) -> int:
+    if not column.isdecimal() or not 1 <= int(column) <= wide:
+        raise ValueError(
+            f"{path} has no header, so timecode_column must be the number of a column, 1 to {wide}, but is {column!r}"
+        )
+    return int(column) - 1
+
+
 def _json_text(item: Any, name: str, place: str) -> str:
     if not isinstance(item, dict) or not isinstance(item.get(name), str):
         raise ValueError(f"{place}: expected a number or text for {name!r}, got {item!r}")
     return str(item[name]).strip()
+
+
+_ISO_START = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
 
 
 def plain(name: str) -> str:

@@ -1,10 +1,11 @@
-"""SHA-256 of files, remembered."""
+"""SHA-256 of files, remembered. A folder, as of pictures, is one: its names and contents."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import json
+import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,7 +18,7 @@ SETTLED_SECONDS = 2.0
 
 Signature = list[int]
 """Size, time of modification and of change of state in nanoseconds, inode. Whoever writes to a file can set the first
-time back, but not the second one"""
+time back, but not the second one. Of a folder: size of all files in it, latest times, and what names and inodes say"""
 UNKNOWN: Signature = [-1, -1, -1, -1]
 
 
@@ -44,7 +45,7 @@ class FileDigests:
         return {name: found[str(path.resolve())][-1] for name, path in files.items()}
 
     def _entry(self, path: Path, known: Mapping[str, list[Any]]) -> list[Any]:
-        if not path.is_file():
+        if not path.exists():
             raise FileNotFoundError(f"no file {path}")
         seen = signature(path)
         entry = known.get(str(path.resolve()))
@@ -66,12 +67,40 @@ class FileDigests:
 
 
 def signature(path: Path) -> Signature:
-    """By which a change of a file shows; raises FileNotFoundError without it."""
+    """By which a change of a file shows, or of any file in a folder; raises FileNotFoundError without it."""
     stat = path.stat()
-    return [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
+    if not path.is_dir():
+        return [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
+    files = {file.name: file.stat() for file in files_of(path)}
+    names = hashlib.sha256()
+    for name, own in files.items():
+        told = f"\0{own.st_size} {own.st_mtime_ns} {own.st_ctime_ns} {own.st_ino}\n"
+        names.update(os.fsencode(name) + told.encode())
+    seen = files.values()
+    return [
+        sum(own.st_size for own in seen),
+        max([stat.st_mtime_ns, *(own.st_mtime_ns for own in seen)]),
+        max([stat.st_ctime_ns, *(own.st_ctime_ns for own in seen)]),
+        int.from_bytes(names.digest()[:7]),
+    ]
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file's content, 64 hex digits."""
+    """SHA-256 of a file's content, or of the names and contents of the files in a folder, 64 hex digits."""
+    if path.is_dir():
+        return folder_digest(path, file_digest)
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def folder_digest(folder: Path, digest: Callable[[Path], str]) -> str:
+    """SHA-256 of names and contents, given that of a file."""
+    whole = hashlib.sha256()
+    for file in files_of(folder):
+        whole.update(os.fsencode(file.name) + f"\0{digest(file)}\n".encode())
+    return whole.hexdigest()
+
+
+def files_of(folder: Path) -> list[Path]:
+    """Files that lie in a folder, hidden ones passed over, by name."""
+    return sorted(path for path in folder.iterdir() if not path.name.startswith(".") and path.is_file())

@@ -13,16 +13,18 @@ import errno
 import json
 import os
 import pickle
+import select
 import shutil
 import signal
 import subprocess
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from packuv.budget import USUAL_BYTES
 from packuv.progress import Progress, no_progress
@@ -43,6 +45,9 @@ ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 squares, three at a time on two cores); nothing here needs them"""
 RAISED_AS = (FileNotFoundError, NotADirectoryError, PermissionError, OSError, ValueError, MemoryError)
 """Kinds of exception that keep their kind on the way out of a job, the particular before the general"""
+CHECK_SECONDS = 0.5
+"""Between two looks at whether a job is still wanted"""
+PIPE_BYTES = 65_536
 PR_SET_PDEATHSIG = 1
 JOB_FILE = "job.pickle"
 FULL_BYTES = 1_000_000
@@ -99,11 +104,13 @@ class Jobs:
         folder: Path,
         progress: Progress = no_progress,
         keep_open: Sequence[int] = (),
+        check: Callable[[], None] = lambda: None,
     ) -> Done:
         """Call the job in a process of its own, with whom to tell, and wait for it.
 
         The job is pickled, so what it refers to must be importable by name. It returns plain values. `folder` receives
-        spec.json, job.pickle and job.log. The process inherits the descriptors in `keep_open`.
+        spec.json, job.pickle and job.log. The process inherits the descriptors in `keep_open`. `check` is called twice
+        a second; what it raises ends the job, and is raised here.
 
         Raises what the job raised if that is ValueError, OSError or MemoryError (a subclass counts as these), JobError
         for any other exception, JobDiedError if the process ended without a word, CancelledError after `cancel`.
@@ -112,14 +119,14 @@ class Jobs:
         spec = folder / "spec.json"
         (folder / JOB_FILE).write_bytes(pickle.dumps(job))
         reader, writer = os.pipe()
-        with open(reader, "rb") as messages:
+        with open(reader, "rb", buffering=0) as messages:
             try:
                 spec.write_text(json.dumps({"job": repr(job), "parent": os.getpid(), "pipe": writer}, indent=1))
                 process = self._start(spec, folder / "job.log", [writer, *keep_open])
             finally:
                 os.close(writer)
             with self._watched(process):
-                last = _follow(messages, progress)
+                last = _follow(messages, progress, check)
                 process.wait()
         return self._outcome(last, process.returncode, job, folder / "job.log")
 
@@ -174,17 +181,17 @@ class Jobs:
                 f"the job {job} ended without a result ({_described(code)}); its output is in {log}", log
             )
         if "error" in last:
-            raised = _exception(last["error"], log)
-            if isinstance(raised, JobError) or (type(raised) is OSError and not raised.errno):
+            error = raised(last["error"], log)
+            if isinstance(error, JobError) or (type(error) is OSError and not error.errno):
                 _blame_disk(log.parent)
-            raise raised
+            raise error
         return Done(last["result"], last["peak_memory_bytes"], last["cpu_seconds"], last["cpu"])
 
 
-def _follow(messages: Any, progress: Progress) -> dict[str, Any] | None:
+def _follow(messages: BinaryIO, progress: Progress, check: Callable[[], None]) -> dict[str, Any] | None:
     """Pass progress on until the job closes its end; its last word, or None."""
     last = None
-    for line in messages:
+    for line in _lines(messages, check):
         with contextlib.suppress(ValueError):  # a line cut short by a kill
             message = json.loads(line)
             if "done" in message:
@@ -194,6 +201,29 @@ def _follow(messages: Any, progress: Progress) -> dict[str, Any] | None:
     return last
 
 
+def _lines(messages: BinaryIO, check: Callable[[], None]) -> Iterator[bytes]:
+    """What comes through an unbuffered pipe; while nothing does, and between, `check` is called now and then."""
+    rest, due = b"", time.monotonic() + CHECK_SECONDS
+    while True:
+        if time.monotonic() >= due:
+            check()
+            due = time.monotonic() + CHECK_SECONDS
+        if not _readable(messages):
+            continue
+        if not (found := messages.read(PIPE_BYTES)):
+            yield rest
+            return
+        *lines, rest = (rest + found).split(b"\n")
+        yield from lines
+
+
+def _readable(messages: BinaryIO) -> bool:
+    """Whether something is there, or comes soon; `select` takes no descriptor beyond 1023."""
+    poll = select.poll()
+    poll.register(messages.fileno(), select.POLLIN)
+    return bool(poll.poll(1000 * CHECK_SECONDS))
+
+
 def _kill(process: subprocess.Popen[bytes]) -> None:
     """End the job and what it started: it leads a session, and so a process group, of its own."""
     with contextlib.suppress(ProcessLookupError):
@@ -201,14 +231,16 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def end_leftovers(folder: Path) -> None:
-    """End processes that an earlier job in this folder started and that outlived it, as after a kill -9.
+    """End processes that an earlier job in this folder, or in one in it, started and that outlived it, as after a
+    kill -9.
 
-    Linux only. The caller holds the lock on the folder, so no job that is still wanted works there.
+    Linux only, and on this machine. The caller knows that no job that is still wanted works there.
     """
     mark = os.fsencode(f"{MARK}={folder.absolute()}")
     for environment in Path("/proc").glob("[0-9]*/environ"):
         with contextlib.suppress(OSError):  # ended meanwhile, or somebody else's
-            if mark in environment.read_bytes().split(b"\0"):
+            words = environment.read_bytes().split(b"\0")
+            if any(word == mark or word.startswith(mark + b"/") for word in words):
                 os.kill(int(environment.parent.name), signal.SIGKILL)
 
 
@@ -224,14 +256,15 @@ def _blame_disk(folder: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
-def _exception(error: Mapping[str, Any], log: Path) -> Exception:
+def raised(error: Mapping[str, Any], log: Path) -> Exception:
+    """What `told` told, of a kind that callers know; else a JobError."""
     for kind in RAISED_AS:
         if kind.__name__ in error["kinds"]:
-            raised = kind(error["message"])
-            if isinstance(raised, OSError):
-                raised.errno, raised.strerror, raised.filename = error["errno"], error["strerror"], error["filename"]
-            raised.add_note(f"the job's own traceback is in {log}")
-            return raised
+            found = kind(error["message"])
+            if isinstance(found, OSError):
+                found.errno, found.strerror, found.filename = error["errno"], error["strerror"], error["filename"]
+            found.add_note(f"the job's own traceback is in {log}")
+            return found
     return JobError(f"{error['kinds'][0]}: {error['message']}; the traceback is in {log}", log)
 
 
@@ -282,10 +315,11 @@ def _result(job: Path, progress: Progress) -> dict[str, Any]:
     except Exception as error:
         with contextlib.suppress(OSError):  # a full disk has no room for the log either
             traceback.print_exc()
-        return {"error": _told(error)}
+        return {"error": told(error)}
 
 
-def _told(error: Exception) -> dict[str, Any]:
+def told(error: Exception) -> dict[str, Any]:
+    """An exception as plain values, which `raised` takes back."""
     system = error if isinstance(error, OSError) else OSError()
     return {
         "kinds": [kind.__name__ for kind in type(error).__mro__],

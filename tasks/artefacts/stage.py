@@ -25,6 +25,9 @@ from packuv.budget import USUAL_BYTES
 from packuv.progress import Progress
 from tasks.artefacts.store import Key, Store
 
+BASE_BYTES = 1_000_000_000
+"""Of a job beside pictures and layers: the libraries, the Gaussians and what the optimizer keeps of them"""
+
 Notes = Mapping[str, Any]
 """What a stage says about its work, for the receipt; plain values"""
 
@@ -54,6 +57,23 @@ class Site:
 
 
 @dataclass(frozen=True)
+class Needs:
+    """What a job takes of a machine while it runs."""
+
+    cores: int
+    memory_bytes: int
+    gpus: int = 0
+
+    def __str__(self) -> str:
+        gpus = f", {self.gpus} GPU" if self.gpus else ""
+        return f"{self.cores} core{'s' * (self.cores != 1)}, {self.memory_bytes / 1e9:.1f} GB{gpus}"
+
+    def fits(self, offer: Needs) -> bool:
+        """Whether a machine that has `offer` can ever do it."""
+        return self.cores <= offer.cores and self.memory_bytes <= offer.memory_bytes and self.gpus <= offer.gpus
+
+
+@dataclass(frozen=True)
 class Work:
     """What a job is given beside its stage."""
 
@@ -77,6 +97,8 @@ class Stage(ABC):
     """Folder of its artefacts; several stages may make the same kind"""
     version: ClassVar[int]
     """Raised with every change that alters what the job makes; tests/tasks/stages/test_golden.py watches"""
+    small: ClassVar[bool] = False
+    """Uses one core and holds no pictures"""
 
     @property
     def label(self) -> str:
@@ -86,6 +108,13 @@ class Stage(ABC):
     @abstractmethod
     def build(self, work: Work) -> Notes:
         """The job: fill `work.out`. ValueError and OSError are for bad input, and reach the user as they are."""
+
+    def needs(self, site: Site) -> Needs:
+        """What its job takes there, roughly: the memory is that of the site and what any program takes."""
+        if self.small:
+            return Needs(1, BASE_BYTES)
+        on_gpu = any(getattr(value, "device", "cpu") == "cuda" for value in self.settings.values())
+        return Needs(site.threads, site.memory_bytes + BASE_BYTES, int(on_gpu))
 
     def spared(self, folder: Path, notes: Notes) -> Iterable[tuple[str, str]]:
         """Work that this sequence did not need, as (what, why), told by the artefact."""

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+from packuv.progress import Progress, no_progress
 from sync.capture import Capture
-from tasks.artefacts.jobs import Jobs
+from tasks.artefacts.jobs import Jobs, end_leftovers
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.stage import Files, Notes, Site, Stage, StageJob
 from tasks.artefacts.store import Building, Key, Store
@@ -34,6 +35,22 @@ class Listener(Protocol):
         """Work that this sequence does not need."""
 
 
+Maker = Callable[["Workshop", Stage], Key]
+"""Makes the artefact of a stage unless it is there, and tells the workshop's listener how far it is"""
+
+
+def make_here(workshop: Workshop, stage: Stage) -> Key:
+    """A `Maker`: by a job on this machine."""
+    return make_by_job(
+        stage,
+        workshop.site,
+        workshop.jobs,
+        originals=workshop.originals.look,
+        progress=partial(workshop.listener.moved, stage.label),
+        waiting=partial(workshop.listener.waiting, stage.label),
+    )
+
+
 @dataclass(frozen=True)
 class Workshop:
     """Where the stages of one sequence are made."""
@@ -42,7 +59,9 @@ class Workshop:
     originals: Originals
     """The capture"""
     jobs: Jobs
+    """Those of the run; once they are cancelled, nothing more is made"""
     listener: Listener
+    maker: Maker = make_here
 
     @property
     def capture(self) -> Capture:
@@ -69,13 +88,8 @@ class Workshop:
         """
         start = time.monotonic()
         self.listener.started(stage.label)
-        build = partial(self._build, stage)
-        waiting = partial(self._wait, stage.label)
-        originals = self.originals.look
         try:
-            key = self.store.make(
-                stage.name, stage.version, stage.settings, stage.sources, build, originals=originals, waiting=waiting
-            )
+            key = self.maker(self, stage)
         except BaseException as error:
             self.listener.failed(stage.label, error)
             raise
@@ -88,21 +102,47 @@ class Workshop:
         """Folder of a complete artefact."""
         return self.store.path(key)
 
-    def _wait(self, label: str) -> None:
-        self.jobs.check()
-        self.listener.waiting(label)
 
-    def _build(self, stage: Stage, building: Building) -> dict[str, Any]:
-        done = self.jobs.run(
-            StageJob(stage, self.site, building.out, building.scratch),
+def make_by_job(
+    stage: Stage,
+    site: Site,
+    jobs: Jobs,
+    *,
+    originals: Callable[[], Mapping[str, Any]],
+    progress: Progress = no_progress,
+    waiting: Callable[[], None] = lambda: None,
+    check: Callable[[], None] = lambda: None,
+) -> Key:
+    """The artefact of a stage, by a process on this machine if it is not there.
+
+    Raises what `Store.make` and `Jobs.run` raise. `check` is called twice a second while the job runs; what it raises
+    ends the job.
+    """
+    store = Store(site.store)
+
+    def build(building: Building) -> dict[str, Any]:
+        end_leftovers(building.out.parents[1])
+
+        def still() -> None:
+            building.check()
+            check()
+
+        done = jobs.run(
+            StageJob(stage, site, building.out, building.scratch),
             folder=building.out.parent,
-            progress=partial(self.listener.moved, stage.label),
+            progress=progress,
             keep_open=[building.lock],
+            check=still,
         )
         notes: Notes = done.value or {}
-        return {
-            **notes,
-            "peak_memory_bytes": done.peak_memory_bytes,
-            "cpu_seconds": done.cpu_seconds,
-            "cpu": done.cpu,
-        }
+        measured = {"peak_memory_bytes": done.peak_memory_bytes, "cpu_seconds": done.cpu_seconds, "cpu": done.cpu}
+        return {**notes, **measured}
+
+    def wait() -> None:
+        jobs.check()
+        check()
+        waiting()
+
+    return store.make(
+        stage.name, stage.version, stage.settings, stage.sources, build, originals=originals, waiting=wait
+    )

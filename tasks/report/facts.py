@@ -22,6 +22,7 @@ from packuv.metrics import trend
 from packuv.scene import Scene
 from packuv.scene.stream import REPEAT
 from sync.align import SyncReport
+from sync.natural import natural_key
 
 MAX_PSNR_DB = 99.0
 """Equal pictures have an infinite ratio, which neither JSON nor a mean can hold; they count as this"""
@@ -272,6 +273,8 @@ class ReportInput:
     held_out: tuple[str, ...] = ()
     """Cameras that were never fitted"""
     check: RigReport | None = None
+    footage: tuple[str, ...] = ()
+    """What was read of the videos and what was not, where it is not plain, and which pictures are damaged"""
     colours: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """By camera: how its video says that it codes colour, see `sync.probe.ColourTags`"""
     unlike: Mapping[str, str] = field(default_factory=dict)
@@ -296,7 +299,7 @@ def scene_figures(scene: Scene, *, verified: bool | None = None, problem: str = 
     index = scene.index
     sizes: list[int] = []
     for number, segment in enumerate(index.segments):
-        packets = iter(index.tracks[-1].sizes[segment.first_packet :])
+        packets = iter(index.tracks[-1].sizes[segment.first_packet : segment.first_packet + segment.frames])
         sizes.append(index.tracks[0].sizes[number])
         sizes += [0 if prediction == REPEAT else next(packets) for prediction in segment.predictions]
     return SceneFigures(
@@ -324,9 +327,9 @@ def frames_to_picture(scores: Sequence[FrameScore]) -> tuple[tuple[str, int, str
 
 
 def by_camera(scores: Sequence[FrameScore]) -> dict[str, list[FrameScore]]:
-    """Scores of each camera, in order of frames; cameras by name."""
+    """Scores of each camera, in order of frames; cameras in natural order."""
     cameras: dict[str, list[FrameScore]] = {}
-    for score in sorted(scores, key=lambda item: (item.camera, item.frame)):
+    for score in sorted(scores, key=lambda item: (natural_key(item.camera), item.camera, item.frame)):
         cameras.setdefault(score.camera, []).append(score)
     return cameras
 

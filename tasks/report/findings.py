@@ -61,6 +61,7 @@ def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...
     """Everything in the report that crosses a limit, in the order of the page."""
     return (
         *_run_findings(report),
+        *(Finding("sync", f"{note}.") for note in report.footage),
         *_sync_findings(report, limits),
         *_rig_findings(report, limits),
         *_light_findings(report, limits),

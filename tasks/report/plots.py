@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 
 import numpy as np
@@ -15,6 +15,11 @@ from calibration.rig import Camera
 WIDTH = 960
 LEFT, RIGHT, TOP, BOTTOM = 56, 96, 14, 38
 """Margins around a chart's field, px: numbers, names of the series, nothing, the axis"""
+MOST_POINTS = 1600
+"""Of a line: two for each pixel across, the least and the most that lie there"""
+MOST_BARS = 800
+MOST_MARKS = 200
+"""More vertical lines would be a surface; then there are none"""
 LINE_HEIGHT = 14
 TICKS = 5
 
@@ -58,30 +63,63 @@ def line_chart(
     from_zero: bool = False,
     height: int = 260,
 ) -> Markup:
-    """Lines over a common axis, named at their ends; `marks` are vertical lines, such as keyframes."""
+    """Lines over a common axis, named at their ends; `marks` are vertical lines, such as keyframes.
+
+    A long line is drawn by the least and the most of each part of it, which look the same; many marks are left out.
+    """
+    series = [thinned(item) for item in series]
     field = _field(series, from_zero, height)
-    parts = [_grid(field, x_label, y_label), *(_mark(field, mark) for mark in marks)]
+    shown = marks if len(marks) <= MOST_MARKS else ()
+    parts = [_grid(field, x_label, y_label), *(_mark(field, mark) for mark in shown)]
     parts += [_line(field, item) for item in series]
     parts += _end_labels(field, series)
     return _svg(WIDTH, height, title, parts)
 
 
+def thinned(series: Series) -> Series:
+    """The same line by at most about `MOST_POINTS` points: the least and the most of each stretch of it, and its ends.
+
+    A stretch without a single finite value stays a gap.
+    """
+    count = len(series.y)
+    if count <= MOST_POINTS:
+        return series
+    y = np.asarray(series.y, np.float64)
+    kept = [0, count - 1]
+    for part in np.array_split(np.arange(count), MOST_POINTS // 2):
+        known = part[np.isfinite(y[part])]
+        kept += [known[y[known].argmin()], known[y[known].argmax()]] if len(known) else [part[0]]
+    places = np.unique(kept).tolist()
+    return replace(series, x=[series.x[place] for place in places], y=[series.y[place] for place in places])
+
+
 def bar_chart(
     values: Sequence[float], *, title: str, x_label: str, y_label: str, strong: Sequence[int] = (), height: int = 220
 ) -> Markup:
-    """One bar per value, from zero; `strong` ones stand out, such as keyframes."""
+    """One bar per value, from zero; `strong` ones stand out, such as keyframes. Of many values that lie side by side,
+    the largest has a bar, the largest strong one behind it."""
     field = Field(-0.5, len(values) - 0.5, 0, _ceiling(max(values, default=0)), height)
     parts = [_grid(field, x_label, y_label)]
+    width = -(-len(values) // MOST_BARS) or 1
     gap = 0.15 if len(values) < 200 else 0
     chosen = set(strong)
-    for index, value in enumerate(values):
-        x, right = field.x(index - 0.5 + gap), field.x(index + 0.5 - gap)
-        style = "bar strong" if index in chosen else "bar"
-        parts.append(
-            f'<rect class="{style}" x="{x:.2f}" y="{field.y(value):.2f}" width="{right - x:.2f}" '
-            f'height="{field.y(0) - field.y(value):.2f}"><title>{index}: {value:.3g}</title></rect>'
-        )
+    for first in range(0, len(values), width):
+        stretch = range(first, min(first + width, len(values)))
+        kinds = {style: [index for index in stretch if (index in chosen) == (style == "bar strong")]
+                 for style in ("bar strong", "bar")}  # fmt: skip
+        for style, places in kinds.items():
+            if places:
+                most = max(places, key=lambda index: values[index])
+                x, right = field.x(stretch[0] - 0.5 + gap), field.x(stretch[-1] + 0.5 - gap)
+                parts.append(_bar(field, style, x, right, values[most], f"{most}: {values[most]:.3g}"))
     return _svg(WIDTH, height, title, parts)
+
+
+def _bar(field: Field, style: str, left: float, right: float, value: float, tip: str) -> str:
+    return (
+        f'<rect class="{style}" x="{left:.2f}" y="{field.y(value):.2f}" width="{right - left:.2f}" '
+        f'height="{field.y(0) - field.y(value):.2f}"><title>{tip}</title></rect>'
+    )
 
 
 def sparkline(counts: Sequence[int], *, title: str, width: int = 104, height: int = 22) -> Markup:

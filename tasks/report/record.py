@@ -4,20 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from tasks.artefacts.recipe import plain
-from tasks.report.facts import LEVELS, MAX_PSNR_DB, FrameScore, ReportInput, by_camera, mean_of, still_trend
+from tasks.report.facts import (
+    LEVELS,
+    MAX_PSNR_DB,
+    FrameScore,
+    ReportInput,
+    SceneFigures,
+    by_camera,
+    mean_of,
+    still_trend,
+)
 from tasks.report.findings import LIMITS, Limits, findings
 
 SCHEMA = 1
 """Version of report.json"""
+MOST_FRAMES = 5000
+"""By which a list by frame goes whole into report.json"""
 
 
 def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
-    """All numbers of the report, without its pictures; docs/viewer.md names the fields."""
+    """The numbers of the report, without its pictures; docs/viewer.md names the fields. Of a long scene, lists by frame
+    hold every so manieth frame."""
+    every = -(-_frames(report) // MOST_FRAMES) or 1
     return {
         "schema": SCHEMA,
         "name": report.name,
@@ -31,6 +45,7 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
             "choice": report.choice and plain(report.choice),
             "forecast": [plain(row) for row in report.forecast],
         },
+        "every": every,
         "summary": summary(report),
         "findings": [plain(finding) for finding in findings(report, limits)],
         "sync": report.sync and report.sync.to_json(),
@@ -38,22 +53,35 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
         "check": report.check and report.check.to_json(),
         "light": report.light
         and {
-            "factors": np.exp(report.light.light).round(5).tolist(),
-            "exposures": {name: np.exp(own).round(5).tolist() for name, own in report.light.exposures.items()},
+            "factors": np.exp(report.light.light[::every]).round(5).tolist(),
+            "exposures": {name: np.exp(own[::every]).round(5).tolist() for name, own in report.light.exposures.items()},
             "reason": report.light.reason,
         },
         "motion": report.motion
         and {
-            "magnitude_px": [float(v) if math.isfinite(v) else None for v in report.motion.magnitude_px],
+            "magnitude_px": [float(v) if math.isfinite(v) else None for v in report.motion.magnitude_px[::every]],
             "keyframes": list(report.motion.keyframes),
             "changes": [plain(change) for change in report.motion.changes],
             "cuts": list(report.motion.cuts),
         },
-        "scores": [_score_json(score) for score in report.scores],
-        "scene": report.scene and {**plain(report.scene), "mb_per_30_frames": report.scene.mb_per_30_frames},
+        "scores": [_score_json(score) for score in report.scores if score.frame % every == 0],
+        "scene": report.scene and _scene_json(report.scene, every),
         "pictures": [{"camera": c.camera, "frame": c.frame, "choice": c.choice} for c in report.pictures],
         "stages": [plain(stage) for stage in report.stages],
     }
+
+
+def _frames(report: ReportInput) -> int:
+    """Of the longest list by frame."""
+    motion, light, scene = report.motion, report.light, report.scene
+    return max(
+        len(motion.magnitude_px) if motion else 0, len(light.light) if light else 0, scene.frames if scene else 0
+    )
+
+
+def _scene_json(scene: SceneFigures, every: int) -> dict[str, Any]:
+    by_frame = {name: getattr(scene, name)[::every] for name in ("frame_bytes", "gaussians", "dynamic")}
+    return {**plain(replace(scene, **by_frame)), "mb_per_30_frames": scene.mb_per_30_frames}
 
 
 def _score_json(score: FrameScore) -> dict[str, Any]:

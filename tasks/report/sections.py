@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,10 +28,22 @@ from tasks.report.facts import (
 )
 from tasks.report.findings import Finding, Limits, corner_light
 from tasks.report.pictures import DIFFERENCE_GAIN, comparison
-from tasks.report.plots import Series, Volume, bar_chart, gain_chart, line_chart, rig_views, sparkline
+from tasks.report.plots import (
+    MOST_BARS,
+    MOST_MARKS,
+    Series,
+    Volume,
+    bar_chart,
+    gain_chart,
+    line_chart,
+    rig_views,
+    sparkline,
+)
 
 MANY_LINES = 6
 """With more cameras than this, only the worst and the mean are named"""
+MANY_STAGES, WORST_STAGES = 24, 6
+"""Of more stages that are alike than the first, so many have a row, and one row sums up the rest"""
 BAR_PX = 220
 """The longest stage's bar"""
 
@@ -111,6 +125,7 @@ def _sync_row(row: CameraReport, sync: SyncReport, limits: Limits) -> View:
     clock = row.clock
     return {
         "camera": row.camera,
+        "source": row.source,
         "offset_ms": clock.offset_ns / 1e6,
         "offset_error_ms": clock.offset_error_ns / 1e6,
         "drift_ppm": clock.drift_ppm,
@@ -210,6 +225,7 @@ def _motion(report: ReportInput) -> Body:
     series = [Series("M(t)", range(count), [float(value) for value in motion.magnitude_px])]
     return {
         "segments": len(motion.keyframes),
+        "marked": len(motion.keyframes) <= MOST_MARKS,
         "shortest": min(lengths, default=0),
         "longest": max(lengths, default=0),
         "changes": [{"frame": change.frame, "cameras": change.cameras} for change in motion.changes],
@@ -309,6 +325,7 @@ def _size(report: ReportInput) -> Body:
         "means": [(kind, sizes[rows].mean()) for kind, rows in kinds if rows.any()],
         "whole_mb": scene.bytes / 1e6,
         "overhead_mb": scene.bytes / 1e6 - sizes.sum(),
+        "each": scene.frames <= MOST_BARS,
         "frames": bar_chart(sizes.tolist(), title="Size over time", x_label="frame", y_label="MB", strong=keyframes),
     }
 
@@ -343,8 +360,46 @@ def _stages(report: ReportInput) -> Body:
     if not ran:
         return "No stage was recorded."
     longest = max(stage.seconds for stage in ran) or 1
-    rows = [_stage_row(stage, longest) for stage in ran]
-    return {"seconds": sum(stage.seconds for stage in ran), "stages": rows, "forecast": report.forecast}
+    shown, rest = told_apart(ran, lambda stage: (stage.outcome is StageOutcome.FAILED, stage.seconds))
+    return {
+        "seconds": sum(stage.seconds for stage in ran),
+        "stages": [_stage_row(stage, longest) for stage in shown],
+        "rest": [_rest_row(kind, stages) for kind, stages in rest.items()],
+        "forecast": report.forecast,
+    }
+
+
+def told_apart(
+    stages: Sequence[StageRecord], worth: Callable[[StageRecord], Any]
+) -> tuple[list[StageRecord], dict[str, list[StageRecord]]]:
+    """Stages that a table shows, in order, and the rest by kind: of a kind with many stages it shows those that are
+    worth most, of equals the first. Stages are of one kind where their labels differ in numbers alone."""
+    kinds: dict[str, list[StageRecord]] = {}
+    for stage in stages:
+        kinds.setdefault(re.sub(r"[\d,-]+", "N", stage.label), []).append(stage)
+    rest: dict[str, list[StageRecord]] = {}
+    hidden: set[int] = set()
+    for own in kinds.values():
+        if len(own) > MANY_STAGES:
+            rest[_kind(own[0])] = others = sorted(own, key=worth, reverse=True)[WORST_STAGES:]
+            hidden.update(map(id, others))
+    return [stage for stage in stages if id(stage) not in hidden], rest
+
+
+def _kind(stage: StageRecord) -> str:
+    """What stages that are alike are called: the words before the first number."""
+    return re.split(r"\s*[\d(]", stage.label)[0] or stage.label
+
+
+def _rest_row(kind: str, stages: Sequence[StageRecord]) -> View:
+    outcomes = Counter(str(stage.outcome) for stage in stages)
+    memory = max((stage.peak_memory_bytes or 0 for stage in stages), default=0)
+    return {
+        "label": f"{len(stages):,} more: {kind}",
+        "seconds": sum(stage.seconds for stage in stages),
+        "memory_mb": memory / 1e6 if memory else None,
+        "outcome": ", ".join(f"{count:,} {outcome}" for outcome, count in outcomes.items()),
+    }
 
 
 def _stage_row(stage: StageRecord, longest: float) -> View:
@@ -363,7 +418,10 @@ def _skipped(report: ReportInput) -> Body:
     skipped = [stage for stage in report.stages if stage.outcome is StageOutcome.SKIPPED]
     if not skipped:
         return "Nothing was skipped."
-    return {"stages": [{"label": stage.label, "reason": stage.reason} for stage in skipped]}
+    shown, rest = told_apart(skipped, lambda stage: 0)
+    rows = [{"label": stage.label, "reason": stage.reason} for stage in shown]
+    more = [{"label": f"{len(own):,} more: {kind}", "reason": "for the like reason"} for kind, own in rest.items()]
+    return {"stages": rows + more}
 
 
 def _run(report: ReportInput) -> Body:

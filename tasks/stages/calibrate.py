@@ -66,7 +66,7 @@ class PointOptions:
 class ImportRig(Stage):
     """Import the calibration of the capture and judge it by the pictures: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 3
+    name, version = "rig", 4
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -93,7 +93,7 @@ class ImportRig(Stage):
                 'calibration = "solve" into capture.toml to have it solved, or use it as it is with '
                 "--set rig.trust=true"
             )
-        odd = {**_turned(judgement), **_strays(capture, source)}
+        odd = {**_turned(judgement), **_strays(capture, source), **judgement.doubts}
         _save_rig(judgement.rig, self.options, judgement.to_json(), work.out, odd=odd)
         held, verdict = f"{place} holds {kind}", judgement.matches.reason
         return {"source": "import", "given": held, "reading": judgement.reading.value, "verdict": verdict}

@@ -20,9 +20,8 @@ from packuv.progress import Progress
 from packuv.scene import SceneHeader, open_scene
 from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
 from sync.align import AlignOptions, FrameGroups, align
-from sync.capture import find_capture, load_timecodes
+from sync.capture import find_capture, load_timecodes, probe_capture
 from sync.clock import ClockMode
-from sync.probe import probe_video
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.report.facts import FrameScore, frames_to_picture
@@ -65,7 +64,7 @@ class Evaluate(Stage):
         views, scene = Footage(self.take, work.site).open_views(), work.path(self.scene) / SCENE
         lpips = Lpips(Path(self.weights)) if self.backbone else None
         with open_scene(scene) as opened:
-            scores = score(opened, views, work.progress, lpips=lpips, workers=work.site.threads)
+            scores = score(opened, views, work.progress, lpips=lpips, workers=work.site.threads, scratch=work.scratch)
             write_table(work.out / TABLE, scores)
             write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
             borders = segment_starts(opened)
@@ -141,7 +140,7 @@ def _max_width(extra: Mapping[str, Any]) -> int | None:
 
 def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
     found = find_capture(capture)
-    infos = {camera: probe_video(path) for camera, path in found.videos.items()}
+    infos = probe_capture(found)
     what = "the scene's header: sync"
     reference, tolerance_ns, clock = (field(sync, name, what) for name in ("reference", "tolerance_ns", "clock"))
     if tolerance_ns is not None:

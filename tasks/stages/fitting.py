@@ -301,6 +301,7 @@ class CutSegment(Stage):
     """The first frames of a segment, as a segment."""
 
     name, version = "segment", 7
+    small = True
     segment: Key
     frames: int
 

@@ -6,13 +6,25 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calibration.rig import Camera, Rig
 from packuv.budget import Budget
 from packuv.camera import PinholeCamera
-from packuv.footage import FrameReader, LensCamera, Light, Transfer, Views, looks_like_log
+from packuv.files import load_json
+from packuv.footage import (
+    DamageLog,
+    FrameReader,
+    LensCamera,
+    Light,
+    Transfer,
+    Views,
+    WatchingReader,
+    looks_like_log,
+    without,
+)
 from sync.align import FrameGroups
 from sync.capture import find_capture
 from tasks.artefacts.stage import Site
@@ -23,6 +35,12 @@ RIG = "rig.json"
 """Name of the rig's file in artefacts"""
 LIGHT = "light.npz"
 """Name of the file of light and exposures over time in artefacts"""
+PACKETS = ".packets"
+"""Folder in the store for what the packets of long videos tell"""
+LIGHT_FACTS = "light.json"
+"""Name of the file beside it, in words and figures"""
+DAMAGED = "damaged"
+"""Key in these facts of the pictures that are damaged; missing where none is"""
 HDR_TAGS = ("arib-std-b67", "smpte2084")
 """Tags of videos that say what their code values mean, HLG and PQ"""
 
@@ -72,13 +90,25 @@ class Footage:
     site: Site
 
     def load_groups(self) -> FrameGroups:
-        """The selected instants of all cameras."""
+        """The selected instants of all cameras; of a take with light, damaged pictures count as missing."""
         groups = FrameGroups.load(self.site.path(self.take.groups))
         chosen = selected(groups, self.take.first, self.take.stop)
         rows = slice(chosen.start, chosen.stop)
-        return FrameGroups(
-            groups.cameras, groups.reference, groups.times_ns[rows], groups.frames[rows], groups.residuals_ns[rows]
-        )
+        frames = groups.frames[rows]
+        if damaged := self._load_damaged():
+            frames = frames.copy()
+            for column, name in enumerate(groups.cameras):
+                if name in damaged:
+                    frames[:, column] = without(frames[:, column], damaged[name])
+        return FrameGroups(groups.cameras, groups.reference, groups.times_ns[rows], frames, groups.residuals_ns[rows])
+
+    def _load_damaged(self) -> dict[str, Any]:
+        """What the stage that saw all pictures says of damaged ones, by camera, see `DamageLog.facts`."""
+        if self.take.light is None:
+            return {}
+        facts: dict[str, Any] = load_json(self.site.path(self.take.light) / LIGHT_FACTS)
+        found: dict[str, Any] = facts.get(DAMAGED, {})
+        return found
 
     def load_rig(self) -> Rig:
         """The rig of the cameras."""
@@ -106,6 +136,7 @@ class Footage:
             light=light.of(names, len(frames)) if light else None,
             budget=Budget(self.site.memory_bytes),
             spill=spill,
+            reader=self._reader({name: videos[name] for name in names}),
         )
 
     def load_light(self) -> Light | None:
@@ -144,7 +175,16 @@ class Footage:
     def open_reader(self) -> FrameReader:
         """Pictures as filmed, by camera and number of the frame."""
         videos = find_capture(self.site.capture).videos
-        return FrameReader({name: videos[name] for name in self.take.cameras}, transfer=self.take.pictures.transfer)
+        return self._reader({name: videos[name] for name in self.take.cameras})
+
+    def _reader(self, videos: Mapping[str, Path]) -> FrameReader:
+        return FrameReader(videos, transfer=self.take.pictures.transfer, kept=self.site.store / PACKETS)
+
+    def open_watching_reader(self, log: DamageLog) -> WatchingReader:
+        """The same pictures, damaged ones noted in the log."""
+        videos = find_capture(self.site.capture).videos
+        own = {name: videos[name] for name in self.take.cameras}
+        return WatchingReader(own, log, transfer=self.take.pictures.transfer, kept=self.site.store / PACKETS)
 
     def load_frames(self) -> dict[str, np.ndarray]:
         """By camera the number of its frame at each instant of the take, int [T], -1 where it has none."""

@@ -11,16 +11,20 @@ from typing import Any
 import numpy as np
 
 from packuv.files import save_json
-from packuv.footage import LightOptions, measure_light
+from packuv.footage import DamageLog, LightOptions, damage_told, measure_light
 from tasks.artefacts.stage import Notes, Stage, Work
-from tasks.stages.footage import LIGHT, Footage, Take
+from tasks.stages.footage import DAMAGED, LIGHT, LIGHT_FACTS, Footage, Take
 
-FACTS = "light.json"
+DAMAGE = "damage.json"
+"""File of what was found so far"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasureLight(Stage):
-    """Measure light of the instants, and exposures of the cameras that have one of their own: light.npz, light.json."""
+    """Measure light of the instants, and exposures of the cameras that have one of their own: light.npz, light.json.
+
+    All pictures pass here, so it also finds the damaged ones, which count as missing from here on.
+    """
 
     name, version = "light", 1
     take: Take
@@ -31,20 +35,26 @@ class MeasureLight(Stage):
 
     def build(self, work: Work) -> Notes:
         footage = Footage(self.take, work.site)
+        log = DamageLog(work.scratch / DAMAGE)
         light = measure_light(
-            footage.open_reader(),
+            footage.open_watching_reader(log),
             footage.load_frames(),
             self.fitted,
             self.options,
             workers=work.site.threads,
+            kept=work.scratch,
             progress=work.progress,
         )
         light.save(work.out / LIGHT)
         facts = {**light.facts, "range": _range(light.light), "least": self.options.least_light}
-        save_json(work.out / FACTS, facts)
+        if log.found:
+            facts[DAMAGED] = log.facts()
+        save_json(work.out / LIGHT_FACTS, facts)
         return facts
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        for name, facts in notes.get(DAMAGED, {}).items():
+            yield "damaged pictures", damage_told(name, facts)
         if notes["steady"]:
             yield "light of the instant", why_steady(notes)
         if notes["unknown"]:
@@ -62,9 +72,9 @@ def why_steady(facts: Notes) -> str:
 
 
 def is_steady(folder: Path) -> bool:
-    """Whether an artefact says that nothing changes, neither light nor any exposure."""
+    """Whether an artefact says that nothing changes, neither light nor any exposure, and no picture is damaged."""
     facts = _read(folder)
-    return bool(facts["steady"] and not facts["exposures"])
+    return bool(facts["steady"] and not facts["exposures"] and DAMAGED not in facts)
 
 
 def read_steady(folder: Path) -> str:
@@ -73,11 +83,17 @@ def read_steady(folder: Path) -> str:
     return why_steady(facts) if facts["steady"] else ""
 
 
+def read_damage(folder: Path) -> dict[str, dict[str, Any]]:
+    """By damaged camera what is wrong with its pictures, see `DamageLog.facts`."""
+    found: dict[str, dict[str, Any]] = _read(folder).get(DAMAGED, {})
+    return found
+
+
 def _range(light: np.ndarray) -> list[float]:
     """Least and most of any channel, as factors on linear light."""
     return [float(np.exp(light.min(initial=0))), float(np.exp(light.max(initial=0)))]
 
 
 def _read(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / FACTS).read_text())
+    found: dict[str, Any] = json.loads((folder / LIGHT_FACTS).read_text())
     return found

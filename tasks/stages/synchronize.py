@@ -9,20 +9,23 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from packuv.progress import Progress
 from sync.align import AlignOptions, FrameGroups, SyncReport, align, build_index, save_index
-from sync.capture import Capture, find_capture, load_timecodes
-from sync.probe import VideoInfo, probe_video
+from sync.capture import Capture, find_capture, load_timecodes, picture_notes, probe_capture
+from sync.probe import VideoInfo
 from tasks.artefacts.recipe import write_json
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.workshop import Workshop
+
+FOOTAGE = "footage"
+"""Name of the notes on what was read of the videos, and what was not; missing where there are none"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Synchronize(Stage):
     """Match the frames of all cameras: sync.json, groups.arrow, videos.json and the AVL index of each camera."""
 
-    name, version = "sync", 3
+    name, version = "sync", 4
+    small = True
     videos: Files
     timecodes: Files
     fps: Fraction | None
@@ -34,7 +37,7 @@ class Synchronize(Stage):
     def build(self, work: Work) -> Notes:
         found = find_capture(work.site.capture)
         self._check(found)
-        infos = _probe_all(found, work.progress)
+        infos = probe_capture(found, work.progress)
         timecodes = load_timecodes(found, infos)
         groups, report = align(timecodes, self.options)
         groups.save(work.out, report)
@@ -42,7 +45,9 @@ class Synchronize(Stage):
         videos = {camera: _info_to_json(info) for camera, info in infos.items()}
         rate = found.settings.fps or _nominal_rate(infos, report)
         write_json(work.out / "videos.json", {"rate": rate, "videos": videos})
-        return {"instants": len(groups), "cameras": len(groups.cameras), "reference": groups.reference}
+        facts = {"instants": len(groups), "cameras": len(groups.cameras), "reference": groups.reference}
+        notes = [*found.notes, *picture_notes(found, infos), *(note for info in infos.values() for note in info.notes)]
+        return {**facts, FOOTAGE: notes} if notes else facts
 
     def _check(self, found: Capture) -> None:
         """A file that comes and goes while the job runs is seen by nobody else."""
@@ -82,14 +87,6 @@ def read_videos(groups: Path) -> dict[str, dict[str, Any]]:
     return videos
 
 
-def _probe_all(capture: Capture, progress: Progress) -> dict[str, VideoInfo]:
-    infos = {}
-    for done, (camera, path) in enumerate(capture.videos.items()):
-        progress(done, len(capture.videos), camera)
-        infos[camera] = probe_video(path)
-    return infos
-
-
 def _nominal_rate(infos: Mapping[str, VideoInfo], report: SyncReport) -> Fraction:
     """The container's rate of the reference, unless its timecodes run at another one."""
     rate = infos[report.reference].rate
@@ -99,7 +96,7 @@ def _nominal_rate(infos: Mapping[str, VideoInfo], report: SyncReport) -> Fractio
 
 
 def _info_to_json(info: VideoInfo) -> dict[str, Any]:
-    return {
+    facts = {
         "width": info.width,
         "height": info.height,
         "codec": info.codec,
@@ -109,3 +106,4 @@ def _info_to_json(info: VideoInfo) -> dict[str, Any]:
         "bytes": info.size_bytes,
         "colour": asdict(info.colour),
     }
+    return {**facts, "rotation_deg": info.rotation_deg} if info.rotation_deg else facts

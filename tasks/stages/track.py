@@ -72,6 +72,7 @@ class ChooseKeyframes(Stage):
     """Choose keyframes from the motion curve; segments in which nothing moves are named, since nobody fits them."""
 
     name, version = "keyframes", 2
+    small = True
     motion: Key
     options: KeyframeOptions
 

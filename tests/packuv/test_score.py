@@ -106,6 +106,31 @@ def test_raw_scores_are_those_of_the_scene_in_its_light(tmp_path):
     assert max(raw[1:]) < 30
 
 
+def test_scores_do_not_depend_on_parts_and_go_on_after_a_kill(tmp_path, monkeypatch):
+    path = write_wall(tmp_path / "lit.mkv", LIGHT)
+    rng = np.random.default_rng(0)
+    film(tmp_path / "a.mp4", rng.random((3, 3, 64, 96)).astype(np.float32))
+    lenses = [LensCamera(replace(CAMERA, name=name)) for name in "ab"]
+    videos, frames = {name: tmp_path / "a.mp4" for name in "ab"}, np.array([[0, 0], [1, -1], [2, 2]])
+
+    def scored(scratch=None, progress=no_progress):
+        with open_scene(path) as scene:
+            return score(scene, Views(videos, frames, lenses), progress, scratch=scratch)
+
+    whole = scored()
+    assert any(item.psnr_never_moving_db is not None for item in whole)
+    monkeypatch.setattr("packuv.score.PART", 1)
+    for kept in range(3):  # parts that a kill left
+        scratch = tmp_path / f"scratch{kept}"
+        scratch.mkdir()
+        assert scored(scratch) == whole
+        for part in range(kept, 3):
+            (scratch / f"{part:09d}.arrow").unlink()
+        told = []
+        assert scored(scratch, lambda done, total, note="", told=told: told.append((done, note))) == whole
+        assert [done for done, _ in told] == [1, 2, 3]
+
+
 def test_scores_do_not_depend_on_the_number_of_workers(tmp_path):
     path = write_wall(tmp_path / "lit.mkv", LIGHT)
     rng = np.random.default_rng(0)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import av
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -20,6 +21,7 @@ from pipelines.manifest import SCHEMA, Manifest, Row, read_manifest, scan, updat
 from sync.capture import check_name
 from sync.probe import probe_video
 from tasks.artefacts.digests import file_digest
+from tests.support.pictures import write_picture
 from tests.support.places import ROOT
 
 GOLDEN = ROOT / "tests/golden/capture"
@@ -430,3 +432,24 @@ def test_rows_of_all_kinds_come_back(tmp_path):
     rows = (Row("a", "/a", problem="why"), Row("b", "/b", "cam", "videos/c", fps="30000/1001", tags=("x", "y z")))
     write(tmp_path / "m.parquet", Manifest(tmp_path, rows))
     assert read_manifest(tmp_path / "m.parquet") == Manifest(tmp_path, rows)
+
+
+def test_a_folder_of_pictures_is_a_camera(data_set, opened):
+    videos = data_set / "day1/dance/videos"
+    with av.open(str(videos / "cam01.mp4")) as container:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    (videos / "cam01.mp4").unlink()
+    for number, picture in enumerate(pictures):
+        write_picture(videos / "cam01" / f"{number}.png", picture)
+    row = rows_of(data_set)[0]
+    height, width = pictures[0].shape[:2]
+    assert (row.path, row.codec, row.width, row.height) == ("videos/cam01", "png", width, height)
+    assert (row.frames, row.fps, row.duration_s, row.problem) == (len(pictures), None, None, None)
+    assert row.digest == file_digest(videos / "cam01")
+    assert row.bytes == sum(path.stat().st_size for path in (videos / "cam01").iterdir())
+    opened.clear()
+    assert rows_of(data_set)[0] == row
+    assert opened == []
+    write_picture(videos / "cam01" / "0.png", pictures[1])
+    assert rows_of(data_set)[0].digest != row.digest
+    assert opened == ["cam01"]

@@ -7,12 +7,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import pytest
 
 from pipelines.events import Journal
-from pipelines.register import RUNNING, SILENT_SECONDS, Place, bury, find_runs, registered
+from pipelines.register import RUNNING, Place, bury, find_runs, registered
+from tasks.artefacts.presence import LEASE_SECONDS
 from tasks.artefacts.recipe import plain, write_json
 
 HOLDS = """
@@ -80,15 +82,26 @@ def test_a_killed_run_does_not_hide_a_later_one(tmp_path):
     assert json.loads((tmp_path / "run.json").read_text()) == later
 
 
-@pytest.mark.parametrize(("silence", "alive"), [(0, True), (SILENT_SECONDS + 5, False)])
+@pytest.mark.parametrize(("silence", "alive"), [(0, True), (LEASE_SECONDS + 5, False)])
 def test_a_run_on_another_machine_counts_as_killed_after_a_silence(tmp_path, silence, alive):
-    from datetime import UTC, datetime, timedelta
-
     with registered(tmp_path, sequence="dance", capture="/data/dance", preset="draft"):
         (found,) = find_runs(tmp_path)
-    updated = (datetime.now(UTC) - timedelta(seconds=silence)).isoformat(timespec="seconds")
-    found.path.write_text(json.dumps(plain(replace(found.record, host="elsewhere", updated=updated))))
-    assert [run.alive for run in find_runs(tmp_path)] == [alive]
+    # The number is that of a process here, which means nothing: it is another machine's.
+    elsewhere = replace(found.record, host="elsewhere", process=f"elsewhere-0123456789ab-{os.getpid()}-1-00000000")
+    found.path.write_text(json.dumps(plain(elsewhere)))
+    lock = found.path.with_suffix(".lock")
+    lock.touch()
+    os.utime(lock, (time.time() - silence,) * 2)
+    (found,) = find_runs(tmp_path)
+    assert (found.alive, found.record.here) == (alive, False)
+
+
+def test_a_run_is_seen_where_locks_are_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("fcntl.flock", lambda *_: None)
+    with registered(tmp_path, sequence="dance", capture="/data/dance", preset="draft"):
+        (found,) = find_runs(tmp_path)
+        assert found.alive
+        assert found.record.here
 
 
 def test_a_record_cut_short_is_passed_over(tmp_path):

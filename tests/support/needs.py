@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-KINDS = ("avx2", "cuda", "ffmpeg", "chromium", "data")
+KINDS = ("avx2", "cuda", "ffmpeg", "chromium", "data", "postgres")
 VARIABLE = "PACKUV_REQUIRE"
 
 

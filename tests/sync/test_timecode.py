@@ -126,7 +126,7 @@ def test_an_empty_file_is_refused(tmp_path: Path, suffix: str, content: str) -> 
 def test_missing_files_and_other_suffixes(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         read_timecodes(tmp_path / "a.txt")
-    with pytest.raises(ValueError, match=r"\.txt, \.csv or \.json"):
+    with pytest.raises(ValueError, match=r"\.csv, \.tsv, \.txt, \.log, \.json or \.npy"):
         read_timecodes(write(tmp_path / "a.dat", "1"))
 
 
@@ -191,7 +191,7 @@ def test_delimiters_quotes_and_byte_order_marks(tmp_path: Path, delimiter: str) 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1,2\n3,4\n", "first line must name the columns"),
+        ("1,2\n3,4\n", "2 columns and no header"),
         ("frame_number,time_s\n", "no rows"),
         ("frame_number,speed\n0,1\n", "one column must hold the time.*none"),
         ("time_s,arrival_time_s\n0,1\n", "2 of them"),

@@ -160,6 +160,18 @@ def test_a_segment_that_was_cut_off_goes_on_to_the_same_codes(views, key, motion
         assert np.array_equal(resumed.frame(index).attributes, whole.frame(index).attributes)
 
 
+def test_without_optical_flow_moving_rows_start_where_they_were(views, key, motion, tmp_path):
+    lean = dataclasses.replace(motion, options=dataclasses.replace(motion.options, keep_flow=False))
+    still = dataclasses.replace(OPTIONS, lift=dataclasses.replace(OPTIONS.lift, enabled=False))
+    (one, _), (other, _) = (
+        fit_segment(key, views, range(2), motion=cache, options=options, scratch=_made(tmp_path / name))
+        for name, cache, options in (("a", lean, OPTIONS), ("b", motion, still))
+    )
+    assert one.dynamic.any()
+    assert np.array_equal(one.frame(1).xyz, other.frame(1).xyz)
+    assert np.array_equal(one.frame(1).attributes, other.frame(1).attributes)
+
+
 def test_without_motion_nothing_is_fitted(views, key, motion, tmp_path):
     still = dataclasses.replace(motion, steps=motion.steps.copy())
     still.steps["previous"] = -1

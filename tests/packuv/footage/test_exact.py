@@ -13,6 +13,7 @@ from packuv.footage.coding import Coding
 from packuv.footage.develop import Developer
 from packuv.footage.reader import FrameReader
 from packuv.footage.transfer import Transfer
+from sync.probe import probe_video
 from tests.support.planes import shapes, write_planes
 
 COUNT = 48
@@ -81,3 +82,45 @@ def test_a_cut_file_gives_true_frames_or_an_error(tmp_path: Path) -> None:
         assert np.array_equal(picture, whole[number])
         right += 1
     assert right > COUNT // 3
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_videos_are_turned_as_they_are_shown(tmp_path: Path, degrees: int) -> None:
+    picture = np.random.default_rng(0).integers(16, 235, (48, 64, 3)).astype(np.uint8)
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264rgb", rate=30, options={"qp": "0"})
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "bgr24"
+        stream.set_display_rotation(degrees)
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+        container.mux(stream.encode(None))
+    shown = FrameReader({"a": path}).read("a", 1)
+    info = probe_video(path)
+    assert shown.shape[:2] == (info.height, info.width)
+    assert info.rotation_deg == degrees
+    assert np.array_equal(shown, np.rot90(picture, degrees // 90))
+
+
+@pytest.mark.parametrize("default", [0, 1])
+def test_of_several_streams_the_one_that_is_probed_is_read(tmp_path: Path, default: int) -> None:
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as container:
+        streams = []
+        for number, side in enumerate((32, 64)):
+            stream = container.add_stream("ffv1", rate=30)
+            assert isinstance(stream, av.VideoStream)
+            stream.width, stream.height, stream.pix_fmt = side, side, "yuv420p"
+            stream.disposition = av.stream.Disposition.default if number == default else av.stream.Disposition(0)
+            streams.append(stream)
+        for _ in range(4):
+            for stream in streams:
+                plain = np.full((stream.height, stream.width, 3), 100, np.uint8)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(plain, "rgb24")))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    info, reader = probe_video(path), FrameReader({"a": path})
+    assert (info.frame_count, info.width) == (reader.frame_count("a"), reader.read("a", 3).shape[1])
+    assert info.width == (32, 64)[default]
+    assert f"of 2 video streams #{default}" in info.notes[0]

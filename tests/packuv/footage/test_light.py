@@ -204,6 +204,34 @@ def test_one_instant_is_steady():
     assert measured(ratios({name: np.zeros((1, 3)) for name in NAMES[:3]})).steady
 
 
+def test_a_measurement_that_is_cut_off_goes_on_to_the_same(monkeypatch, tmp_path):
+    monkeypatch.setattr("packuv.footage.ratios.KEPT", 5)
+    monkeypatch.setattr("packuv.footage.ratios.HELD", 4)  # else all pictures are read first
+    shot, frames = film(fading(), 0), np.arange(INSTANTS)
+    frames[7] = -1
+    seen: list[int] = []
+
+    def dies(instant: int) -> np.ndarray:
+        seen.append(instant)
+        if len(seen) == 3 + 12:
+            raise KeyboardInterrupt
+        return shot(instant)
+
+    def counts(instant: int) -> np.ndarray:
+        seen.append(instant)
+        return shot(instant)
+
+    whole = measure_ratios(shot, frames, width=WIDTH, samples=3)
+    with pytest.raises(KeyboardInterrupt):
+        measure_ratios(dies, frames, width=WIDTH, samples=3, kept=tmp_path)
+    seen.clear()
+    resumed = measure_ratios(counts, frames, width=WIDTH, samples=3, kept=tmp_path)
+    assert seen[:3] == [0, 12, 23]  # what stands still
+    assert seen[3:] == [t for t in range(11, 23) if t != 12]  # ten are kept
+    assert np.array_equal(resumed.whole, whole.whole, equal_nan=True)
+    assert np.array_equal(resumed.parts, whole.parts, equal_nan=True)
+
+
 def test_long_recordings_are_measured_as_short_ones_are(monkeypatch):
     frames = np.arange(INSTANTS)
     short = measure_ratios(film(fading(), 1), frames, width=WIDTH, samples=9)

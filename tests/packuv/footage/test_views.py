@@ -17,11 +17,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import packuv.footage.packets as packets_module
 from packuv.budget import Budget
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera, undistorted_camera
+from packuv.footage.packets import Packets, packet_seconds
 from packuv.footage.planes import as_planes
-from packuv.footage.reader import FrameReader, packet_seconds
+from packuv.footage.reader import FrameReader
 from packuv.footage.views import Views, _packed, _unpacked
 from tests.support.needs import needs_ffmpeg
 
@@ -80,6 +82,25 @@ def test_dropped_frames_do_not_shift_the_count(tmp_path: Path) -> None:
     assert reader.frame_count("a") == len(ticks)
     assert np.array_equal(reader.read_many("a", range(len(ticks))), numbered()[ticks])
     assert np.allclose(packet_seconds(tmp_path / "a.mp4"), np.array(ticks) / 30, atol=1e-9)
+
+
+def test_what_packets_tell_of_a_long_video_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(tmp_path / "a.mp4", numbered())
+    kept = tmp_path / "kept"
+    assert FrameReader({"a": tmp_path / "a.mp4"}, kept=kept).frame_count("a") == COUNT
+    assert not kept.exists()  # a short one
+    monkeypatch.setattr(packets_module, "LONG", COUNT)
+    first = Packets.read(tmp_path / "a.mp4", kept)
+    with monkeypatch.context() as patched:
+        patched.setattr(packets_module, "_demuxed", lambda *_: pytest.fail("demuxed again"))
+        again = Packets.read(tmp_path / "a.mp4", kept)
+        reader = FrameReader({"a": tmp_path / "a.mp4"}, kept=kept)
+        assert np.array_equal(reader.read_many("a", [33, 2]), numbered()[[33, 2]])
+    assert np.array_equal(first.ticks, again.ticks)
+    assert np.array_equal(first.keys, again.keys)
+    assert (first.base, first.coding) == (again.base, again.coding)
+    write_video(tmp_path / "a.mp4", numbered(20))  # another file of that name
+    assert len(Packets.read(tmp_path / "a.mp4", kept).ticks) == 20
 
 
 def test_closed_decoders_open_again(video: Path, tmp_path: Path) -> None:

@@ -282,6 +282,13 @@ def test_a_killed_measurement_goes_on_to_the_same_bytes(views: Views, cache: Mot
     assert contents(folder) == contents(cache.folder)
 
 
+def test_what_is_measured_is_not_mapped_into_memory(views: Views, tmp_path: Path) -> None:
+    def look(done: float, total: float, note: str = "") -> None:
+        assert str(tmp_path) not in Path("/proc/self/maps").read_text()
+
+    measure_motion(views, tmp_path / "cache", MotionOptions(), workers=1, progress=look)
+
+
 def test_another_recipe_is_refused(views: Views, cache: MotionCache, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="other options; delete it first"):
         measure_motion(views, cache.folder, MotionOptions(tau_px=2))

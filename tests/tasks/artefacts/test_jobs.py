@@ -238,5 +238,5 @@ def test_workshop_makes_an_artefact_by_a_job_and_tells(jobs, work, tmp_path):
     with pytest.raises(ValueError, match="no frames"):
         workshop.make(replace(stage, fails=True))
     assert listener.events[-1][:2] == ("failed", "area")
-    (spec,) = (tmp_path / "store" / ".work").glob("*/spec.json")
+    (spec,) = (tmp_path / "store" / ".work").glob("*/*/spec.json")
     assert "fails=True" in json.loads(spec.read_text())["job"]

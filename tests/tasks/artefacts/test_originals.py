@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import pytest
 
 from sync.capture import find_capture
 from tasks.artefacts import digests
+from tasks.artefacts.digests import file_digest, signature
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
@@ -300,3 +302,29 @@ def test_a_run_that_began_with_other_settings_is_refused_although_nothing_was_re
     originals = Originals(replace(capture), lab.folder / "file_digests.json")
     with pytest.raises(ValueError, match=r"capture\.toml says something else than when this run began"):
         originals.look()
+
+
+def test_a_folder_changes_with_any_of_its_pictures(tmp_path):
+    folder = tmp_path / "cam1"
+    folder.mkdir()
+    for name in ("0.png", "1.png"):
+        (folder / name).write_bytes(name.encode())
+    before, content = signature(folder), file_digest(folder)
+    (folder / ".DS_Store").write_bytes(b"of no account")
+    assert file_digest(folder) == content
+    seen = set[str]()
+    for change in (
+        lambda: (folder / "0.png").write_bytes(b"other"),
+        lambda: (folder / "0.png").rename(folder / "2.png"),
+        lambda: (folder / "3.png").write_bytes(b"new"),
+        lambda: (folder / "3.png").unlink(),
+    ):
+        change()
+        assert signature(folder) != before
+        before = signature(folder)
+        seen.add(file_digest(folder))
+    assert len(seen) == 3
+    assert content not in seen
+    twin = tmp_path / "twin"
+    shutil.copytree(folder, twin)
+    assert file_digest(twin) == file_digest(folder)

@@ -24,7 +24,17 @@ from sync.align import CameraReport, SyncReport
 from sync.clock import Clock, ClockMode, ClockState
 from tasks.report.facts import MAX_PSNR_DB, LastingChange
 from tasks.report.page import SECTIONS, duration, page_text
-from tasks.report.plots import Series, Volume, bar_chart, line_chart, rig_axes, rig_views
+from tasks.report.plots import (
+    MOST_BARS,
+    MOST_POINTS,
+    Series,
+    Volume,
+    bar_chart,
+    line_chart,
+    rig_axes,
+    rig_views,
+    thinned,
+)
 from tasks.report.record import report_json, summary
 from tasks.report.write import (
     Comparison,
@@ -494,6 +504,97 @@ def test_bars_stand_on_zero_and_keep_their_ratio(values: list[float]) -> None:
     top = max(values, default=0)
     if top > 1e-6:
         assert np.allclose(np.array(heights) / max(heights), np.array(values) / top, atol=1e-3)  # two decimals of px
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(MOST_POINTS + 1, 6 * MOST_POINTS))
+def test_a_long_line_keeps_its_extremes_ends_and_gaps(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=count)
+    gap = rng.integers(1, count // 2)
+    values[gap : gap + count // 4] = math.nan
+    line = thinned(Series("a", range(count), values.tolist()))
+    assert len(line.x) <= MOST_POINTS + 2
+    assert list(line.x) == sorted(set(line.x))
+    assert np.array_equal(np.array(line.y), values[list(line.x)], equal_nan=True)
+    assert (np.nanmin(line.y), np.nanmax(line.y)) == (np.nanmin(values), np.nanmax(values))
+    assert (line.x[0], line.x[-1]) == (0, count - 1)
+    assert any(math.isnan(value) for value in line.y)
+
+
+def test_a_short_line_stays_as_it_is() -> None:
+    line = Series("a", range(MOST_POINTS), [1.0] * MOST_POINTS)
+    assert thinned(line) is line
+
+
+LONG = 54_000
+SEGMENTS = 1350
+
+
+def long_report() -> ReportInput:
+    """Half an hour: as many segments with their keyframes, half of the rest skipped."""
+    scores = tuple(FrameScore("cam1", frame, 30.0 - 3 * (frame == 27_001), 0.9, still_db=31.0) for frame in range(LONG))
+    stages = [StageRecord("sync", StageOutcome.MADE, 1.5, 200_000_000)]
+    for number in range(SEGMENTS):
+        name = f"fit segment {number} (frames {40 * number}-{40 * number + 39})"
+        stages.append(StageRecord(f"fit keyframe {40 * number}", StageOutcome.MADE, 2.0, 10**9))
+        stages.append(StageRecord(name, StageOutcome.MADE, 60.0 + (number == 77), 10**9))
+        stages.append(
+            StageRecord(f"fit frames {40 * number}-{40 * number + 39}", StageOutcome.SKIPPED, 0.0, reason="still")
+        )
+    stages[500] = replace(stages[500], outcome=StageOutcome.FAILED, reason="no luck")
+    sizes, counts = (900,) * LONG, (5000,) * LONG
+    return replace(
+        make_report(),
+        light=LightCurve(np.random.default_rng(0).normal(0, 0.02, (LONG, 3)), {"cam2": np.zeros((LONG, 3))}),
+        motion=MotionCurve(np.random.default_rng(1).random(LONG), tuple(range(0, LONG, 40))),
+        scores=scores,
+        scene=SceneFigures("scene.mkv", 10**9, Fraction(30), sizes, counts, counts),
+        stages=tuple(stages),
+    )
+
+
+@pytest.fixture(scope="module")
+def long_page() -> str:
+    return page_text(long_report())
+
+
+def test_half_an_hour_has_no_more_rows_than_a_person_reads(long_page: str) -> None:
+    assert max(table.count("<tr") for table in long_page.split("<table")) < 60
+    for row in (
+        "fit segment 77 (frames",  # the longest
+        f"{SEGMENTS - 6:,} more: fit segment",
+        f"{SEGMENTS - 6:,} more: fit keyframe",
+        f"{SEGMENTS - 6:,} more: fit frames",
+    ):
+        assert row in long_page
+    failed = long_report().stages[500]
+    assert f"<td>{failed.label}</td>" in long_page
+
+
+def test_half_an_hour_has_plots_of_bounded_size(long_page: str) -> None:
+    assert len(long_page) < 1_500_000
+    paths = re.findall(r'<path class="line[^"]*" d="([^"]*)"', long_page)
+    assert paths
+    assert all(len(re.findall(r"[ML]", path)) <= MOST_POINTS + 2 for path in paths)
+    assert long_page.count("<rect") < 2 * MOST_BARS + 400
+    assert 'class="mark"' not in long_page
+    assert "Dashed lines" not in long_page
+
+
+def test_half_an_hour_has_no_list_by_frame_in_its_json() -> None:
+    data = report_json(long_report())
+    assert data["every"] == 11
+    lists = [
+        data["light"]["factors"],
+        data["light"]["exposures"]["cam2"],
+        data["motion"]["magnitude_px"],
+        data["scores"],
+    ]
+    lists += [data["scene"][name] for name in ("frame_bytes", "gaussians", "dynamic")]
+    assert {len(values) for values in lists} == {-(-LONG // 11)}
+    assert [score["frame"] for score in data["scores"][:3]] == [0, 11, 22]
+    assert data["summary"]["frames"] == LONG
+    assert report_json(make_report())["every"] == 1
 
 
 def test_the_rig_is_seen_from_above_and_from_the_side() -> None:

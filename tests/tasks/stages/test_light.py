@@ -14,7 +14,7 @@ from calibration.triangulate import SparsePoints
 from packuv.colour import lit
 from packuv.fit.keyframe import KeyState
 from packuv.fit.start.bounds import Bounds
-from packuv.footage import Light, LightOptions
+from packuv.footage import FrameReader, Light, LightOptions
 from packuv.gaussians.codes import Codes, Quantizer, attribute_count
 from packuv.scene import SceneHeader
 from sync.align import AlignOptions
@@ -28,6 +28,7 @@ from tasks.stages.light import MeasureLight, is_steady, read_steady, why_steady
 from tasks.stages.synchronize import Synchronize
 from tests.support.artefacts import build_here, put
 from tests.support.calibration_scene import ring
+from tests.support.pictures import write_picture
 from tests.support.planes import write_planes
 
 HEIGHT, WIDTH, INSTANTS, JUMP = 64, 96, 10, 6
@@ -178,3 +179,36 @@ def test_points_have_the_colours_of_steady_light():
 )
 def test_why_light_is_steady(facts, said):
     assert why_steady(facts).startswith(said)
+
+
+def test_damaged_pictures_count_as_missing_from_then_on(tmp_path):
+    write_capture(tmp_path / "capture", np.zeros(INSTANTS))
+    videos = tmp_path / "capture" / "videos"
+    pictures = [FrameReader({"a": videos / "cam01.mkv"}).read("a", t) for t in range(INSTANTS)]
+    (videos / "cam01.mkv").unlink()
+    for t, picture in enumerate(pictures):
+        write_picture(videos / "cam01" / f"{t:04d}.png", picture)
+    for t in (3, 4, 7):
+        (videos / "cam01" / f"{t:04d}.png").write_bytes(b"content")
+    site = Site(tmp_path / "store", tmp_path / "capture", 2)
+    sync = Synchronize(
+        videos=Files(dict.fromkeys(NAMES, "content")),
+        timecodes=Files({}),
+        fps=None,
+        timecode_column=None,
+        options=AlignOptions(),
+    )
+    told, folder = build_here(sync, site, tmp_path / "sync")
+    assert "times of cam01 are the numbers of their pictures" in told["footage"][0]
+    groups = put(site, "sync", lambda out: shutil.copytree(folder, out, dirs_exist_ok=True))
+    take = Take(groups=groups, cameras=NAMES)
+    stage = MeasureLight(take=take, fitted=NAMES, options=LightOptions())
+    notes, made = build_here(stage, site, tmp_path / "light")
+    assert not is_steady(made)
+    wanted = "cam01: 3 pictures are damaged (3 lost), frames 3-4, 7; they count as missing"
+    assert ("damaged pictures", wanted) in list(stage.spared(made, notes))
+    key = put(site, "light", lambda out: shutil.copytree(made, out, dirs_exist_ok=True))
+    frames = Footage(replace(take, light=key), site).load_frames()
+    assert frames["cam01"].tolist() == [-1 if t in (3, 4, 7) else t for t in range(INSTANTS)]
+    assert frames["cam00"].tolist() == list(range(INSTANTS))
+    assert Footage(take, site).load_frames()["cam01"].tolist() == list(range(INSTANTS))

@@ -1,0 +1,154 @@
+"""Which cameras of a calibration the pictures doubt, by name.
+
+That most matches fit says little about a single camera, or about a lens that is wrong by a little: right calibrations
+explain 0.86 to 1.0 of the matches, wrong ones 0.55 to 0.98. The distance tells: matches of right cameras lie 0.1 to 0.3
+pixels from their epipolar lines, those of wrong ones 1 to 6. A camera that is wrong along its epipolar lines shows the
+points that the others locate elsewhere (`calibration.moved`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.accept import MatchesReport, MatchOptions, PairMatches, Verdict, pair_errors_px
+from calibration.moved import find_moved
+from calibration.rig import Camera, Rig
+
+FOCAL_SCALES = (0.8, 0.85, 0.91, 0.95, 1.05, 1.1, 1.18, 1.25)
+BENDS = (-0.3, -0.15, -0.07, -0.03, 0.03, 0.07, 0.15, 0.3)
+"""Of k1, for all cameras alike: lenses of a kind, whose distortion was dropped, or was undone already"""
+WHOLE = "the calibration"
+"""What is said of all cameras together is said of it"""
+
+
+@dataclass(frozen=True)
+class DoubtOptions:
+    """From when on a camera is doubted."""
+
+    least_px: float = 0.6
+    """Median Sampson distance of its matches, pixels of the undistorted picture ..."""
+    share: float = 0.0011
+    """... and as a share of the picture's width: lenses are calibrated less exactly in pixels of large pictures"""
+    over_others: float = 2.5
+    """... and at least this many times that of the other cameras: what all have is said of the calibration"""
+
+    better: float = 0.6
+    """Share of the median distance that other lenses leave at most, to be believed"""
+    noise_px: float = 0.15
+    """A median below this cannot be better"""
+
+    def limit_px(self, width: int) -> float:
+        """Of a camera with pictures of this width."""
+        return max(self.least_px, self.share * width)
+
+
+def doubts(
+    rig: Rig,
+    evidence: Sequence[PairMatches],
+    report: MatchesReport,
+    *,
+    judge: MatchOptions,
+    options: DoubtOptions = DoubtOptions(),
+) -> dict[str, str]:
+    """What speaks against single cameras, and against all of them: camera or WHOLE -> what, for people.
+
+    `evidence` are matches found without the poses (`triangulate.verified_matches`), `report` what was made of them.
+    """
+    if report.verdict is Verdict.UNDECIDED:
+        return {WHOLE: f"is neither confirmed nor refuted by the pictures: {report.reason}"}
+    pairs = _medians_px(rig, evidence, judge.min_matches)
+    off, left = _peeled(rig, pairs, options)
+    found = {name: f"lies {px:.1f} px off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
+             for name, px in off.items()}  # fmt: skip
+    standings, moved = find_moved(rig, evidence)
+    for name in moved:
+        where = standings[name]
+        found.setdefault(
+            name,
+            f"stands elsewhere than the calibration says: its picture lies {where.offset_px:.1f} px off, as if it were "
+            f"turned by {where.turned_deg:.1f} degrees and shifted by {100 * where.shifted:.1f} % of the rig's radius",
+        )
+    limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
+    kept = rig.select(name for name in rig.names if name not in off)
+    right = [pair for pair in evidence if not {pair.first, pair.second} & off.keys()]
+    if better := _better_lens(kept, right, judge.min_matches, options):
+        found[WHOLE] = f"fits the pictures better with {better}: its lenses are not those of these videos"
+    elif left and _usual(left) > limit:
+        found[WHOLE] = (
+            f"misses the pictures by {_usual(left):.1f} px in the median, right ones by 0.1 to 0.3: focal lengths, "
+            "principal points, distortion or poses are not those of these videos"
+        )
+    silent = [name for name in rig.names if not any(name in key for key in pairs)]
+    found |= {name: "is not confirmed: the pictures have too few matches with its neighbours" for name in silent}
+    return found
+
+
+WRONG = "its pose, focal length, principal point or distortion is wrong, or its name is another camera's"
+
+Medians = Mapping[frozenset[str], float]
+"""By pair of cameras, median Sampson distance of its matches, pixels"""
+
+
+def _medians_px(rig: Rig, evidence: Sequence[PairMatches], least: int) -> dict[frozenset[str], float]:
+    """Of the pairs that say enough; several instants are put together."""
+    errors: dict[frozenset[str], list[np.ndarray]] = {}
+    for pair in evidence:
+        errors.setdefault(frozenset((pair.first, pair.second)), []).append(pair_errors_px(rig, pair))
+    joined = {key: np.concatenate(found) for key, found in errors.items()}
+    return {key: float(np.median(found)) for key, found in joined.items() if len(found) >= least}
+
+
+def _peeled(rig: Rig, pairs: Medians, options: DoubtOptions) -> tuple[dict[str, float], Medians]:
+    """Cameras that lie off, the worst first, each judged without those before it; and the pairs of the others.
+
+    A wrong camera spoils all of its own pairs, but only one of each neighbour's. Half of the cameras at most: beyond
+    that it is the calibration that is wrong.
+    """
+    left, off = dict(pairs), dict[str, float]()
+    while left and 2 * (len(off) + 1) <= len(rig.cameras):
+        each = {name: _usual({key: px for key, px in left.items() if name in key})
+                for name in rig.names if any(name in key for key in left)}  # fmt: skip
+        worst = max(each, key=lambda name: each[name])
+        others = _usual({key: px for key, px in left.items() if worst not in key})
+        if each[worst] <= max(options.limit_px(rig[worst].width), options.over_others * others):
+            break
+        off[worst] = each[worst]
+        left = {key: px for key, px in left.items() if worst not in key}
+    return off, left
+
+
+def _better_lens(rig: Rig, evidence: Sequence[PairMatches], least: int, options: DoubtOptions) -> str:
+    """What all lenses would have in common with which the pictures agree far better; empty where nothing does."""
+    now = _usual(_medians_px(rig, evidence, least))
+    if now <= options.noise_px:
+        return ""
+    tried = {
+        f"focal lengths of {scale:.0%}": _usual(_medians_px(_with_focal(rig, scale), evidence, least))
+        for scale in FOCAL_SCALES
+    }
+    if not any(camera.fisheye for camera in rig.cameras):
+        tried |= {
+            f"k1 of {bend:+.2f} beside theirs": _usual(_medians_px(_with_bend(rig, bend), evidence, least))
+            for bend in BENDS
+        }
+    best = min(tried, key=lambda name: tried[name])
+    return f"{best} ({tried[best]:.2f} px instead of {now:.2f})" if tried[best] < options.better * now else ""
+
+
+def _with_focal(rig: Rig, scale: float) -> Rig:
+    return replace(rig, cameras=tuple(replace(c, fx=scale * c.fx, fy=scale * c.fy) for c in rig.cameras))
+
+
+def _with_bend(rig: Rig, k1: float) -> Rig:
+    def bent(camera: Camera) -> Camera:
+        values = (*camera.distortion, 0.0, 0.0, 0.0, 0.0)[: max(4, len(camera.distortion))]
+        return replace(camera, distortion=(values[0] + k1, *values[1:]))
+
+    return replace(rig, cameras=tuple(bent(camera) for camera in rig.cameras))
+
+
+def _usual(pairs: Medians) -> float:
+    return float(np.median(list(pairs.values()))) if pairs else 0.0

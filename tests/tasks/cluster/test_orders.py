@@ -1,0 +1,127 @@
+"""What a worker is sent and answers, without a cluster."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tasks.artefacts.jobs import JobDiedError, JobError
+from tasks.artefacts.stage import Needs, Site, Stage
+from tasks.artefacts.store import Store
+from tasks.cluster.orders import Seen, fulfil, offered, order, read, resources
+from tests.support.naps import Nap
+
+
+@dataclass(frozen=True)
+class Options:
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Stage):
+    name, version = "fit", 1
+    options: Options
+
+    def build(self, work):
+        return {}
+
+
+@pytest.fixture
+def site(tmp_path) -> Site:
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture/cam00.mp4").write_bytes(b"film")
+    return Site(tmp_path / "store", tmp_path / "capture", threads=3, memory_bytes=2_000_000_000)
+
+
+@pytest.fixture
+def seen(site) -> dict[str, list[int]]:
+    stat = (site.capture / "cam00.mp4").stat()
+    return {"cam00.mp4": [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]}
+
+
+def test_an_order_is_done_once_and_the_store_says_so(site, seen):
+    stage, heard = Nap(number=1, seconds=0.1), []
+    with Store(site.store).in_use() as present:
+        asked = order(stage, site, seen, present)
+        answers = [fulfil(asked, lambda *values: heard.append(values)) for _ in range(2)]
+    store = Store(site.store)
+    key = store.key(stage.name, stage.version, stage.settings, stage.sources)
+    assert store.holds(key)
+    keys = [read(answer, key, Path("log")) for answer in answers]
+    assert [(made, made.reused) for made in keys] == [(key, False), (key, True)]
+    assert heard
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": "0.0.9"}, r"has \d.*, and whoever asks has PackUV 0\.0\.9; .*install the same on all machines"),
+        ({"code": "0" * 64}, "has the same version, but other code, and whoever asks"),
+        (
+            {"present": "/nowhere/store/.in_use/run-x"},
+            r"does not see /nowhere/store .* --out must be a folder",
+        ),
+        ({"capture": "/nowhere"}, r"cannot read /nowhere/cam00\.mp4 \(No such file or directory\); workers need"),
+        ({"seen": {"cam00.mp4": [5, 0, 0, 0]}}, r"cam00\.mp4 is another file on .* or was written to since"),
+    ],
+)
+def test_a_worker_that_is_not_fit_for_an_order_says_why(site, seen, change, message):
+    with Store(site.store).in_use() as present:
+        asked = {**order(Nap(number=1, seconds=0), site, seen, present), **change}
+        if "version" in change:
+            asked["stage"] = b"what another version writes"
+        answer = fulfil(asked)
+    key = Store(site.store).key("nap", 1, {}, {})
+    with pytest.raises(ValueError, match=message):
+        read(answer, key, Path("log"))
+    assert list(Store(site.store).keys()) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (ValueError("cam03 has no frames"), ValueError),
+        (FileNotFoundError(2, "no such thing", "cam03.mp4"), FileNotFoundError),
+        (OSError(28, "No space left on device", "a.npz"), OSError),
+        (MemoryError(), MemoryError),
+        (JobDiedError("killed by signal 9", Path("/log")), JobDiedError),
+        (JobError("KeyError: x; the traceback is in /log", Path("/log")), JobError),
+    ],
+)
+def test_failures_keep_their_kind_and_words_on_the_way(site, seen, monkeypatch, error, kind):
+    def fails(*_, **__):
+        raise error
+
+    monkeypatch.setattr("tasks.cluster.orders.make_by_job", fails)
+    with Store(site.store).in_use() as present:
+        answer = fulfil(order(Nap(number=1, seconds=0), site, seen, present))
+    with pytest.raises(kind) as caught:
+        read(answer, Store(site.store).key("nap", 1, {}, {}), Path("log"))
+    assert type(caught.value) is kind
+    assert str(caught.value) == str(error)
+    if isinstance(error, OSError):
+        assert caught.value.errno == error.errno
+    if isinstance(error, JobError):
+        assert caught.value.log == error.log
+
+
+def test_a_file_that_is_touched_shows_between_two_looks(site, seen):
+    files = Seen(site.capture, seen)
+    before = files.look()
+    assert before == seen
+    os.chmod(site.capture / "cam00.mp4", 0o600)
+    assert files.look() != before
+
+
+def test_a_stage_says_what_it_needs(site):
+    assert Nap(number=1, seconds=0).needs(site) == Needs(1, 1_000_000_000)
+    assert Fit(options=Options()).needs(site) == Needs(3, 3_000_000_000)
+    on_gpu = Fit(options=Options("cuda")).needs(site)
+    assert on_gpu == Needs(3, 3_000_000_000, 1)
+    assert offered(resources(on_gpu)) == on_gpu
+    assert on_gpu.fits(Needs(4, 3_000_000_000, 1))
+    for small in (Needs(2, 9_000_000_000, 1), Needs(4, 2_000_000_000, 1), Needs(4, 9_000_000_000)):
+        assert not on_gpu.fits(small)
