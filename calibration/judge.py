@@ -48,14 +48,16 @@ class Judgement:
     """Of the calibration as the file gives it; None when its cameras see no common volume"""
     turned: Mapping[str, int] = field(default_factory=dict)
     """By how many quarters clockwise the pictures of cameras stand otherwise than when they were calibrated"""
+    evidence: Sequence[PairMatches] = ()
+    """Matches of neighbouring cameras, found without the poses"""
     doubts: Mapping[str, str] = field(default_factory=dict)
     """What speaks against single cameras, or all of them (`calibration.doubt`)"""
 
     def to_json(self) -> dict[str, Any]:
         given = self.given.to_json() if self.given else None
         turned = {"turned": dict(self.turned)} if self.turned else {}
-        doubts = {"doubts": dict(self.doubts)} if self.doubts else {}
-        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned, **doubts}
+        doubted = {"doubts": dict(self.doubts)} if self.doubts else {}
+        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned, **doubted}
 
 
 def judge(
@@ -72,6 +74,13 @@ def judge(
     clockwise by a quarter, which may have been the wrong way (`calibration.turned`). Raises ValueError for pictures
     that do not fit the rig, and when no reading gives the cameras a common volume.
     """
+    found = _looked(rig, pictures, turned, options)
+    return replace(found, doubts=doubts(found.rig, found.evidence, found.matches, judge=options.judge))
+
+
+def _looked(
+    rig: Rig, pictures: Mapping[str, np.ndarray], turned: Sequence[str], options: TriangulateOptions
+) -> Judgement:
     features = detect_all(rig, pictures, options=options.features)
     if turned:
         evidence = verified_matches(rig, features, pairs_by_look(features, ratio=options.ratio), ratio=options.ratio)
@@ -85,24 +94,27 @@ def judge(
 
 def _judge(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> Judgement:
     given, near = _report(rig, features, options)
-    if given is not None and given.verdict is not Verdict.REJECTED:
-        turned = _head_up(rig, given.bad_cameras, features, near, given, options) if given.bad_cameras else None
-        found = doubts(rig, near, given, judge=options.judge)
-        return turned or Judgement(rig, Reading.AS_GIVEN, given, given, doubts=found)
+    fits = given is not None and given.verdict is not Verdict.REJECTED
+    if given is not None and fits and not given.bad_cameras:
+        return Judgement(rig, Reading.AS_GIVEN, given, given, evidence=near)
     pairs = pairs_by_look(features, ratio=options.ratio)
     evidence = verified_matches(rig, features, pairs, ratio=options.ratio)
+    if given is not None and fits:
+        return _head_up(rig, given.bad_cameras, features, evidence, given, options) or Judgement(
+            rig, Reading.AS_GIVEN, given, given, evidence=near
+        )
     for reading in _by_promise(rig, evidence, options):
         other = reread(rig, reading)
         report, seen = _report(other, features, options)
         if report is not None and report.verdict is Verdict.ACCEPTED:
-            return Judgement(other, reading, report, given, doubts=doubts(other, seen, report, judge=options.judge))
-    if turned := _head_up(rig, rig.names, features, evidence, given, options):
-        return turned
+            return Judgement(other, reading, report, given, evidence=seen)
+    if judgement := _head_up(rig, rig.names, features, evidence, given, options):
+        return judgement
     if given is None:
         raise ValueError(
             f"{rig.source}: the cameras see no common volume, and the pictures agree with no other reading"
         )
-    return Judgement(rig, Reading.AS_GIVEN, given, given)
+    return Judgement(rig, Reading.AS_GIVEN, given, given, evidence=near)
 
 
 def _head_up(
@@ -119,8 +131,7 @@ def _head_up(
     report, seen = _report(other, features, options) if turns else (None, [])
     if report is None or report.verdict is not Verdict.ACCEPTED or set(report.bad_cameras) & set(turns):
         return None
-    found = doubts(other, seen, report, judge=options.judge)
-    return Judgement(other, Reading.AS_GIVEN, report, given, turns, doubts=found)
+    return Judgement(other, Reading.AS_GIVEN, report, given, turns, seen)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
     from packuv.camera import PinholeCamera
 
+MOST_STARTS = 16
+"""First frames of segments that `packuv info` names"""
+
 
 def simulate(arguments: argparse.Namespace) -> int:
     """`packuv simulate`: a capture folder whose truth is known."""
@@ -88,7 +91,7 @@ def _info_text(facts: Mapping[str, Any]) -> str:
         [
             f"{facts['file']}: {size_text(facts['bytes'])}, {size_text(facts['bytes_per_frame'])} a frame",
             f"frames     {facts['frames']} at {facts['rate']} per second, {facts['seconds']:.2f} s",
-            f"segments   {len(counts)}, from frame {', '.join(str(s['first']) for s in facts['segments'])}",
+            f"segments   {len(counts)}, from frame {_starts(facts['segments'])}",
             f"gaussians  {min(counts):,} to {max(counts):,}, of which {min(moving):,} to {max(moving):,} move; "
             f"SH degree {facts['sh_degree']}",
             f"codes      {exact}",
@@ -97,6 +100,15 @@ def _info_text(facts: Mapping[str, Any]) -> str:
             f"tools      {', '.join(f'{name} {version}' for name, version in facts['tools'].items())}",
         ]
     )
+
+
+def _starts(segments: Sequence[Mapping[str, Any]]) -> str:
+    """First frames; of many segments the first few, and how long they are."""
+    firsts = [str(segment["first"]) for segment in segments[:MOST_STARTS]]
+    if len(segments) <= MOST_STARTS:
+        return ", ".join(firsts)
+    lengths = [segment["frames"] for segment in segments]
+    return f"{', '.join(firsts)} and so on, {min(lengths)} to {max(lengths)} frames each (--json lists all)"
 
 
 def verify(arguments: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from uuid import uuid4
 
 import httpx
 import pytest
+from prefect.states import Cancelled, Cancelling, Crashed, Running
 
 import pipelines.link
 from pipelines.link import Link
@@ -75,3 +76,19 @@ def test_a_server_that_stays_away_holds_up_nothing(post):
     server = Server(*[0] * 1000)
     post(server)
     assert server.taken == []
+
+
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [
+        (Running(), None),
+        (Cancelling(), "the run was cancelled"),
+        (Cancelled(), "the run was cancelled"),
+        (Crashed(), "the run was given up"),
+    ],
+)
+def test_a_run_ends_when_its_server_says_so(state, reason):
+    server, told = Server(), list[str]()
+    server.read_flow_run = lambda _: SimpleNamespace(state=state)
+    pipelines.link._hear(server, uuid4(), SimpleNamespace(cancel=told.append))
+    assert told == ([reason] if reason else [])

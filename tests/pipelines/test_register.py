@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import pytest
 
+from pipelines import register as register_module
 from pipelines.events import Journal
 from pipelines.register import RUNNING, Place, bury, find_runs, registered
 from tasks.artefacts.presence import LEASE_SECONDS
@@ -108,3 +109,14 @@ def test_a_record_cut_short_is_passed_over(tmp_path):
     (tmp_path / RUNNING).mkdir()
     (tmp_path / RUNNING / "1.json").write_text('{"sequence": "da')
     assert find_runs(tmp_path) == []
+
+
+def test_a_run_that_says_nothing_for_long_is_still_noted(tmp_path, monkeypatch):
+    monkeypatch.setattr(register_module, "HEARTBEAT_SECONDS", 0.02)
+    with registered(tmp_path, sequence="dance", capture="/data/dance", preset="draft"):
+        (path,) = (tmp_path / RUNNING).glob("*.json")
+        first, deadline = path.stat().st_mtime_ns, time.monotonic() + 10
+        while path.stat().st_mtime_ns == first:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    assert not path.exists(), "nor does it write when the run is over"

@@ -116,7 +116,7 @@ def test_signals_leave_run_json_and_no_job(undisturbed, tmp_path, mode, number, 
     begun(undisturbed, tmp_path, "motion")
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     with subprocess.Popen(words(tmp_path, mode), cwd=ROOT, env=environment(), text=True, **pipes) as run:
-        while not list(tmp_path.glob("tiny/store/.work/motion-*/job.log")):
+        while not list(tmp_path.glob("tiny/store/.work/motion-*/*/job.log")):
             assert run.poll() is None
             time.sleep(0.05)
         for _ in range(2):

@@ -222,7 +222,7 @@ def test_after_a_kill_a_checkpoint_counts_only_if_the_video_did_not_move(lab, mo
         lab.wait_for(0)
         if moved:
             lab.replace_video(WRONG)  # a later frame would come from here ...
-        (checkpoint,) = (lab.folder / "store/.work").glob("*/scratch/checkpoint")
+        (checkpoint,) = (lab.folder / "store/.work").glob("*/*/scratch/checkpoint")
         checkpoint.write_bytes(b"as far as the kill")
         killed.send_signal(signal.SIGKILL)
     if moved:

@@ -1,0 +1,121 @@
+"""Planted faults of single cameras and of all lenses: the pictures name them, and leave right calibrations alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.accept import MatchOptions, PairMatches, Verdict, matches_report
+from calibration.doubt import WHOLE, doubts
+from calibration.judge import judge
+from calibration.rig import Camera, Rig
+from calibration.triangulate import TriangulateOptions, choose_pairs, detect_all, verified_matches
+from tests.support.calibration_scene import arc, render
+
+LENS = (-0.15, 0.05, 0.001, -0.001)
+OPTIONS = TriangulateOptions(judge=MatchOptions(min_explained=0.5))
+WRONG, OTHER = "cam3", "cam1"
+
+
+@pytest.fixture(scope="module")
+def right() -> Rig:
+    return arc(6, span_deg=58, size=(640, 360), lens=LENS)
+
+
+@pytest.fixture(scope="module")
+def evidence(right) -> list[PairMatches]:
+    """Matches found without the poses, and so the same for any: but for the lenses, which RANSAC takes out."""
+    pictures = {camera.name: render(camera, oversample=1) for camera in right.cameras}
+    features = detect_all(right, pictures, options=OPTIONS.features)
+    return verified_matches(right, features, choose_pairs(right, neighbours=8), ratio=OPTIONS.ratio)
+
+
+def found(rig: Rig, evidence: list[PairMatches]) -> dict[str, str]:
+    return doubts(rig, evidence, matches_report(rig, evidence, options=OPTIONS.judge), judge=OPTIONS.judge)
+
+
+def one(change: Callable[[Camera], Camera]) -> Callable[[Rig], Rig]:
+    return lambda rig: replace(rig, cameras=tuple(change(c) if c.name == WRONG else c for c in rig.cameras))
+
+
+def every(change: Callable[[Camera], Camera]) -> Callable[[Rig], Rig]:
+    return lambda rig: replace(rig, cameras=tuple(map(change, rig.cameras)))
+
+
+def turned(axis: int) -> Callable[[Camera], Camera]:
+    """By two degrees."""
+
+    def turn(camera: Camera) -> Camera:
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(np.radians(2.0) * np.eye(3)[axis])[0]
+        return replace(camera, camera_from_world=pose @ camera.camera_from_world)
+
+    return turn
+
+
+def moved(axis: int) -> Callable[[Camera], Camera]:
+    """By 3 % of the rig's radius of 3."""
+
+    def move(camera: Camera) -> Camera:
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ (0.09 * np.eye(3)[axis])
+        return replace(camera, camera_from_world=pose)
+
+    return move
+
+
+def longer(camera: Camera) -> Camera:
+    return replace(camera, fx=1.1 * camera.fx, fy=1.1 * camera.fy)
+
+
+def aside(camera: Camera) -> Camera:
+    return replace(camera, cx=camera.cx + 0.05 * camera.width)
+
+
+def flat(camera: Camera) -> Camera:
+    return replace(camera, distortion=())
+
+
+FAULTS: dict[str, tuple[Callable[[Rig], Rig], str]] = {
+    "focal length": (one(longer), WRONG),
+    "focal lengths": (every(longer), WHOLE),
+    "principal point": (one(aside), WRONG),
+    "principal points": (every(aside), WHOLE),
+    "no distortion": (one(flat), WRONG),
+    "no distortions": (every(flat), WHOLE),
+    "turned about x": (one(turned(0)), WRONG),
+    "turned about y": (one(turned(1)), WRONG),
+    "turned about z": (one(turned(2)), WRONG),
+    "moved across": (one(moved(1)), WRONG),
+    "moved along": (one(moved(0)), WRONG),
+}
+
+
+def test_a_right_calibration_is_not_doubted(right, evidence):
+    assert found(right, evidence) == {}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_planted_fault_is_named(right, evidence, fault):
+    change, named = FAULTS[fault]
+    assert set(found(change(right), evidence)) == {named}
+
+
+def test_two_cameras_whose_names_were_swapped_are_refused_or_named(right, evidence):
+    poses = {WRONG: right[OTHER].camera_from_world, OTHER: right[WRONG].camera_from_world}
+    cameras = (replace(c, camera_from_world=poses.get(c.name, c.camera_from_world)) for c in right.cameras)
+    swapped = replace(right, cameras=tuple(cameras))
+    report = matches_report(swapped, evidence, options=OPTIONS.judge)
+    assert report.verdict is Verdict.REJECTED or {WRONG, OTHER} <= set(found(swapped, evidence))
+
+
+def test_pictures_that_say_nothing_leave_a_calibration_unconfirmed():
+    rig = arc(4)
+    blank = {camera.name: np.full((camera.height, camera.width, 3), 90, np.uint8) for camera in rig.cameras}
+    judgement = judge(rig, blank, options=OPTIONS)
+    assert judgement.doubts[WHOLE].startswith("is neither confirmed nor refuted by the pictures")
+    assert judgement.to_json()["doubts"] == dict(judgement.doubts)
