@@ -196,6 +196,6 @@ def _resected(camera: Camera, xyz: np.ndarray, flat: np.ndarray, options: MovedO
 
 def _errors_px(camera: Camera, xyz: np.ndarray, flat: np.ndarray) -> np.ndarray:
     """Distance of points in the undistorted picture, infinite behind the camera: float64 [P]."""
-    pixels, depth = replace(camera, distortion=()).project(xyz)
+    pixels, depth = replace(camera, distortion=(), fisheye=False).project(xyz)
     errors: np.ndarray = np.where(depth > 0, np.linalg.norm(pixels - flat, axis=1), np.inf)
     return errors

@@ -153,7 +153,7 @@ def test_pictures_of_fisheyes_agree_with_their_poses_and_not_with_a_pinholes():
     assert judgement.matches.verdict is Verdict.ACCEPTED
     assert judgement.matches.pair_median_px is not None
     assert judgement.matches.pair_median_px < 0.5  # a right calibration of sharp pictures stays below 1
-    straight = Rig(tuple(replace(c, distortion=(), fisheye=False) for c in cameras), "taken for pinholes")
+    straight = Rig(tuple(replace(c, fisheye=False, distortion=()) for c in cameras), "taken for pinholes")
     wrong = judge(straight, pictures).matches
     assert wrong.pair_median_px is None or wrong.pair_median_px > 2 * judgement.matches.pair_median_px
     points = triangulate(rig, [pictures])

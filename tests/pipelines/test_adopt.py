@@ -117,11 +117,11 @@ def test_a_published_layout_becomes_a_capture_whose_calibration_reads(tmp_path, 
     assert settings == {"name": "day one-take-1", **({"held_out": list(held_out)} if held_out else {})}
     sizes = dict.fromkeys(cameras, (2048, 1088))
     assert load_rig(folder / "calibration", cameras, sizes).names == tuple(cameras)
-    if layout in ("n3dv", "immersive", "brics", "colmap"):  # videos
-        capture = find_capture(folder)
-        assert list(capture.videos) == cameras
-        assert capture.settings.held_out == held_out
-        assert len(capture.timecodes) == (2 if layout == "brics" else 0)
+    capture = find_capture(folder)
+    assert list(capture.videos) == cameras
+    assert capture.settings.held_out == held_out
+    assert capture.calibration is not None
+    assert len(capture.timecodes) == (2 if layout == "brics" else 0)
     assert len(list((folder / "masks").glob("*"))) == {"panoptic": 4, "actorshq": 2}.get(layout, 0)
 
 
