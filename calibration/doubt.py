@@ -32,8 +32,14 @@ class DoubtOptions:
     """Median Sampson distance of its matches, pixels of the undistorted picture ..."""
     share: float = 0.0011
     """... and as a share of the picture's width: lenses are calibrated less exactly in pixels of large pictures"""
-    over_others: float = 2.5
+    over_others: float = 4.0
     """... and at least this many times that of the other cameras: what all have is said of the calibration"""
+    accusing: int = 2
+    """Pairs that must speak against a camera: patterns that repeat let a single one match on a geometry of its own"""
+    confirming: int = 8
+    """Matches with which a pair speaks for its cameras, where most of them fit: chance ones never do"""
+    fitting: float = 0.6
+    """Share of them that must"""
 
     better: float = 0.6
     """Share of the median distance that other lenses leave at most, to be believed"""
@@ -60,7 +66,8 @@ def doubts(
     if report.verdict is Verdict.UNDECIDED:
         return {WHOLE: f"is neither confirmed nor refuted by the pictures: {report.reason}"}
     pairs = _medians_px(rig, evidence, judge.min_matches)
-    off, left = _peeled(rig, pairs, options)
+    known = _confirming_px(rig, evidence, judge, options) | pairs
+    off, left = _peeled(rig, known, options)
     found = {name: f"lies {px:.1f} px off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
              for name, px in off.items()}  # fmt: skip
     standings, moved = find_moved(rig, evidence)
@@ -81,7 +88,7 @@ def doubts(
             f"misses the pictures by {_usual(left):.1f} px in the median, right ones by 0.1 to 0.3: focal lengths, "
             "principal points, distortion or poses are not those of these videos"
         )
-    silent = [name for name in rig.names if not any(name in key for key in pairs)]
+    silent = [name for name in rig.names if not any(name in key for key in known)]
     found |= {name: "is not confirmed: the pictures have too few matches with its neighbours" for name in silent}
     return found
 
@@ -93,12 +100,27 @@ Medians = Mapping[frozenset[str], float]
 
 
 def _medians_px(rig: Rig, evidence: Sequence[PairMatches], least: int) -> dict[frozenset[str], float]:
-    """Of the pairs that say enough; several instants are put together."""
+    """Of the pairs that have so many matches at least."""
+    return {key: float(np.median(found)) for key, found in _errors_px(rig, evidence).items() if len(found) >= least}
+
+
+def _confirming_px(
+    rig: Rig, evidence: Sequence[PairMatches], judge: MatchOptions, options: DoubtOptions
+) -> dict[frozenset[str], float]:
+    """Of the pairs that speak for their cameras."""
+    return {
+        key: float(np.median(found))
+        for key, found in _errors_px(rig, evidence).items()
+        if len(found) >= options.confirming and (found <= judge.max_error_px).mean() >= options.fitting
+    }
+
+
+def _errors_px(rig: Rig, evidence: Sequence[PairMatches]) -> dict[frozenset[str], np.ndarray]:
+    """Sampson distances by pair; several instants are put together."""
     errors: dict[frozenset[str], list[np.ndarray]] = {}
     for pair in evidence:
         errors.setdefault(frozenset((pair.first, pair.second)), []).append(pair_errors_px(rig, pair))
-    joined = {key: np.concatenate(found) for key, found in errors.items()}
-    return {key: float(np.median(found)) for key, found in joined.items() if len(found) >= least}
+    return {key: np.concatenate(found) for key, found in errors.items()}
 
 
 def _peeled(rig: Rig, pairs: Medians, options: DoubtOptions) -> tuple[dict[str, float], Medians]:
@@ -109,8 +131,10 @@ def _peeled(rig: Rig, pairs: Medians, options: DoubtOptions) -> tuple[dict[str, 
     """
     left, off = dict(pairs), dict[str, float]()
     while left and 2 * (len(off) + 1) <= len(rig.cameras):
-        each = {name: _usual({key: px for key, px in left.items() if name in key})
-                for name in rig.names if any(name in key for key in left)}  # fmt: skip
+        own = {name: {key: px for key, px in left.items() if name in key} for name in rig.names}
+        each = {name: _usual(pairs) for name, pairs in own.items() if _accused(rig[name], pairs, options)}
+        if not each:
+            break
         worst = max(each, key=lambda name: each[name])
         others = _usual({key: px for key, px in left.items() if worst not in key})
         if each[worst] <= max(options.limit_px(rig[worst].width), options.over_others * others):
@@ -148,6 +172,12 @@ def _with_bend(rig: Rig, k1: float) -> Rig:
         return replace(camera, distortion=(values[0] + k1, *values[1:]))
 
     return replace(rig, cameras=tuple(bent(camera) for camera in rig.cameras))
+
+
+def _accused(camera: Camera, pairs: Medians, options: DoubtOptions) -> bool:
+    """Whether enough pairs speak against a camera; of one that has a single pair, that one."""
+    against = sum(px > options.limit_px(camera.width) for px in pairs.values())
+    return against >= min(options.accusing, max(1, len(pairs)))
 
 
 def _usual(pairs: Medians) -> float:

@@ -78,6 +78,27 @@ def judge(
     return replace(found, doubts=doubts(found.rig, found.evidence, found.matches, judge=options.judge))
 
 
+def look_again(
+    judgement: Judgement, instants: Iterable[Mapping[str, np.ndarray]], *, options: TriangulateOptions = _DEFAULTS
+) -> Judgement:
+    """The judgement with what pictures of further instants say of its doubts, one after another until none is left.
+
+    Cameras start late, and a scene may show little at one instant.
+    """
+    rig = judgement.rig
+    pairs, evidence = choose_pairs(rig, neighbours=options.neighbours), list(judgement.evidence)
+    for pictures in instants:
+        features = detect_all(rig, pictures, options=options.features)
+        near = [(first, second) for first, second in pairs if first in features and second in features]
+        evidence += verified_matches(rig, features, near, ratio=options.ratio)
+        matches = matches_report(rig, evidence, options=options.judge)
+        found = doubts(rig, evidence, matches, judge=options.judge)
+        judgement = replace(judgement, matches=matches, evidence=evidence, doubts=found)
+        if not found:
+            break
+    return judgement
+
+
 def _looked(
     rig: Rig, pictures: Mapping[str, np.ndarray], turned: Sequence[str], options: TriangulateOptions
 ) -> Judgement:

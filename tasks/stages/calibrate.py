@@ -14,7 +14,7 @@ from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
 from calibration.colour import BalanceOptions, ColourReport, balance, with_colours
 from calibration.held_out import balance_held_out
 from calibration.importers import find_calibration, load_rig
-from calibration.judge import Judgement, SharedJudgement, judge, judge_shared
+from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
@@ -45,7 +45,7 @@ class RigOptions:
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
     """A camera without a pose is of no use: all must be placed"""
     more_instants: int = 4
-    """Instants, spread over the recording, to solve from when one does not suffice"""
+    """Instants, spread over the recording, to solve from, or to judge a calibration by, when one does not suffice"""
 
     def __post_init__(self) -> None:
         if self.more_instants < 1:
@@ -93,6 +93,11 @@ class ImportRig(Stage):
                 'calibration = "solve" into capture.toml to have it solved, or use it as it is with '
                 "--set rig.trust=true"
             )
+        if judgement.doubts:
+            work.progress(0, 1, "comparing it with more pictures")
+            last = len(footage.load_groups().times_ns) - 1
+            later = np.unique(np.linspace(self.first, last, self.options.more_instants + 1).round().astype(int))[1:]
+            judgement = look_again(judgement, map(footage.filmed, later), options=self.options.judge)
         odd = {**_turned(judgement), **_strays(capture, source), **judgement.doubts}
         _save_rig(judgement.rig, self.options, judgement.to_json(), work.out, odd=odd)
         held, verdict = f"{place} holds {kind}", judgement.matches.reason
