@@ -32,7 +32,7 @@ from pipelines.request import RunRequest
 from pipelines.results import Ending, Run, collect, ending_of, run_json
 from pipelines.stages import Made, Sequence
 from sync.capture import Capture, check_name, find_capture
-from tasks.artefacts.jobs import CancelledError, Jobs
+from tasks.artefacts.jobs import CancelledError, JobError, Jobs
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.recipe import plain, write_json
 from tasks.artefacts.retention import RUN
@@ -182,18 +182,29 @@ def foreseen(run: Run, journal: Journal) -> Forecast | None:
     """What the run will take, had nothing been there; None where that is not worth a look, or others do the work."""
     if run.request.cluster is not None:
         return None
-    capture, jobs, folder = run.workshop.capture, run.workshop.jobs, run.workshop.store.root.parent
-    size, at_once = size_of(capture, run.plan), jobs_at_once(run.request)
+    try:
+        found = _foreseen(run, journal)
+    except (ValueError, OSError, JobError) as error:  # what is wrong with the capture, the stages say better
+        journal.told(FORECAST, f"none: {error}")
+        return None
+    if found is not None:
+        journal.told(FORECAST, found.told)
+    return found
+
+
+def _foreseen(run: Run, journal: Journal) -> Forecast | None:
+    jobs, folder = run.workshop.jobs, run.workshop.store.root.parent
+    size, at_once = size_of(run.workshop.capture, run.plan), jobs_at_once(run.request)
     question = question_of(run.plan, size, (run.options,))
     rough = forecast(size, run.options, Machine(Guess(), at_once), run.request.stop_after)
     if rough.minutes < WORTH_MINUTES and remembered(folder, question, jobs) is None:
         return None
     journal.started(FORECAST)
-    machine = machine_of(folder, question, jobs, at_once, progress=partial(journal.moved, FORECAST))
-    found = forecast(size, run.options, machine, run.request.stop_after)
-    journal.ended(FORECAST)
-    journal.told(FORECAST, found.told)
-    return found
+    try:
+        machine = machine_of(folder, question, jobs, at_once, progress=partial(journal.moved, FORECAST))
+    finally:
+        journal.ended(FORECAST)
+    return forecast(size, run.options, machine, run.request.stop_after)
 
 
 def is_made(request: RunRequest) -> bool:
