@@ -13,6 +13,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -310,6 +311,7 @@ def _rows(plan: _Plan, reading: Mapping[str, Future[dict[str, Any]]]) -> list[Ro
         capture,
         {name: videos[name]["frames"] for name in capture.cameras if "frames" in videos[name]},
         {name: row.timecode_check for name, row in plan.known.items()},
+        {name: Fraction(rate) for name in capture.cameras if (rate := videos[name].get("fps"))},
     )
     return [
         _row(
@@ -353,14 +355,14 @@ def _time_source(capture: Capture, camera: str, video: Mapping[str, Any]) -> str
 
 
 def _check_timecodes(
-    capture: Capture, frames: Mapping[str, int], known: Mapping[str, str | None]
+    capture: Capture, frames: Mapping[str, int], known: Mapping[str, str | None], rates: Mapping[str, Fraction]
 ) -> dict[str, dict[str, str]]:
     """`timecode_check` or `problem` of these cameras; a file that fitted before is not read again."""
     if not capture.timecodes:
         return {}
     checks = {camera: _timecode_check(capture, camera, count) for camera, count in frames.items()}
     unsure = {camera: frames[camera] for camera, check in checks.items() if check is None or known.get(camera) != check}
-    found = {camera: {"problem": problem} for camera, problem in _timecode_problems(capture, unsure).items()}
+    found = {camera: {"problem": problem} for camera, problem in _timecode_problems(capture, unsure, rates).items()}
     return {camera: {"timecode_check": check} for camera, check in checks.items() if check is not None} | found
 
 
@@ -375,17 +377,17 @@ def _timecode_check(capture: Capture, camera: str, frames: int) -> str | None:
     return " ".join(map(str, (*seen, frames, capture.settings.fps, capture.settings.timecode_column)))
 
 
-def _timecode_problems(capture: Capture, frames: Mapping[str, int]) -> dict[str, str]:
+def _timecode_problems(capture: Capture, frames: Mapping[str, int], rates: Mapping[str, Fraction]) -> dict[str, str]:
     """By camera. They are read together, and one by one if that fails, to find whose fault it is."""
     if not frames:
         return {}
     try:
-        file_timecodes(capture, frames)
+        file_timecodes(capture, frames, rates)
         return {}
     except (ValueError, OSError) as error:
         if len(frames) == 1:
             return dict.fromkeys(frames, sentence(error))
-    alone = (_timecode_problems(capture, {camera: count}) for camera, count in frames.items())
+    alone = (_timecode_problems(capture, {camera: count}, rates) for camera, count in frames.items())
     return {camera: problem for problems in alone for camera, problem in problems.items()}
 
 

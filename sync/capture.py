@@ -19,7 +19,7 @@ from sync.clock import ClockMode
 from sync.natural import natural_key
 from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
 from sync.probe import VideoInfo, container_timecodes, probe_video
-from sync.timecode import SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
+from sync.timecode import NANOSECONDS, SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
 
 VIDEO_FOLDERS = ("videos", "images", "rgbs", "ims")
 """Where the videos or pictures of the cameras lie: our own layout, then those that data sets publish"""
@@ -256,7 +256,8 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
         return together({camera: container_timecodes(infos[camera]) for camera in capture.cameras})
     frames = {camera: infos[camera].frame_count for camera in capture.cameras}
     periods = {camera: period for camera in capture.cameras if (period := _period_ns(infos[camera]))}
-    found = together(file_timecodes(capture, frames, periods))
+    rates = {camera: infos[camera].rate for camera in capture.cameras if not infos[camera].numbered}
+    found = together(file_timecodes(capture, frames, rates))
     labels = {camera: container_timecodes(infos[camera]) for camera in found if infos[camera].start_label}
     return {
         camera: codes.noting(
@@ -305,13 +306,13 @@ def _label_notes(camera: str, found: Mapping[str, Timecodes], labels: Mapping[st
 
 
 def file_timecodes(
-    capture: Capture, frames: Mapping[str, int], periods: Mapping[str, int] | None = None
+    capture: Capture, frames: Mapping[str, int], rates: Mapping[str, Fraction] | None = None
 ) -> dict[str, Timecodes]:
     """Timecodes of these cameras from their files, numbered by the frames of their videos.
 
     Args:
         frames: how many the video has, by camera.
-        periods: time between two of them in the container, ns, by camera, where it is known.
+        rates: of these per second in the container, by camera, where it is known: labels count at it, units follow.
 
     Raises:
         ValueError: as `load_timecodes`.
@@ -322,20 +323,22 @@ def file_timecodes(
             f"{capture.folder / 'timecodes'} has no file for {lacking}, though it has for others; "
             "add these, or list the cameras under 'ignore' in capture.toml"
         )
-    settings = capture.settings
+    settings, rates = capture.settings, rates or {}
+    counted = {camera: _label_rate(settings.fps, rates.get(camera)) for camera in capture.cameras}
+    periods = {camera: round(NANOSECONDS / rate) for camera, rate in rates.items()}
     paths = set(capture.timecodes.values())
     if len(paths) == 1:
         read = read_shared_timecodes(
-            paths.pop(), capture.cameras, rate=settings.fps, column=settings.timecode_column, period_ns=periods
+            paths.pop(), capture.cameras, rates=counted, column=settings.timecode_column, period_ns=periods
         )
     else:
         read = {
             camera: read_timecodes(
                 capture.timecodes[camera],
                 camera=camera,
-                rate=settings.fps,
+                rate=counted[camera],
                 column=settings.timecode_column,
-                period_ns=(periods or {}).get(camera),
+                period_ns=periods.get(camera),
             )
             for camera in frames
         }
@@ -343,9 +346,23 @@ def file_timecodes(
         camera: replace(
             numbered(read[camera], capture.videos[camera], count, camera=camera),
             source=f"timecodes/{capture.timecodes[camera].name}",
-        )
+        ).noting(*_counting_notes(read[camera], settings.fps, counted[camera]))
         for camera, count in frames.items()
     }
+
+
+def _label_rate(said: Fraction | None, video: Fraction | None) -> Fraction | None:
+    """At which a camera's labels count: what capture.toml says, unless the video runs at a rate that is no multiple of
+    that; then, and where nothing is said, that of the video."""
+    if said is None or video is None:
+        return said or video
+    ratio = max(said / video, video / said)
+    return said if abs(ratio / round(ratio) - 1) < RATE_OFF / 2 else video
+
+
+def _counting_notes(codes: Timecodes, said: Fraction | None, counted: Fraction | None) -> Iterator[str]:
+    if codes.labelled and said is not None and counted != said:
+        yield f"its labels are counted at {counted} per second, the rate of its video, and not at fps = {said}"
 
 
 def numbered(codes: Timecodes, video: Path, count: int, *, camera: str) -> Timecodes:

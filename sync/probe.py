@@ -151,7 +151,7 @@ def container_timecodes(info: VideoInfo) -> Timecodes:
     times = labels_to_ns([info.start_label], rate) + (times - times[0])
     other = f"its container's label counts at {rate} per second, its video runs at {info.rate}"
     day, notes = day_of(info.start_label, rate), (other,) if rate != info.rate else ()
-    return Timecodes(times, numbers, day, f"the container's label {info.start_label}", notes)
+    return Timecodes(times, numbers, day, f"the container's label {info.start_label}", notes=notes)
 
 
 def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:

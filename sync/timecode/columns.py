@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from sync.timecode.digits import parse_decimals
-from sync.timecode.labels import day_of, is_clock, is_label, read_clocks, read_labels
+from sync.timecode.labels import counting_notes, day_of, is_clock, is_label, read_clocks, read_labels
 from sync.timecode.series import DAY_NS, Timecodes, counted_from_first, unwrapped, wrap_notes
 from sync.timecode.tables import Table, plain
 from sync.tree import TIME_LIMIT_NS
@@ -28,11 +28,13 @@ SOME = 1000
 """Rows that tell of all"""
 FEWEST_ROWS = 4
 """From which on a last line can be held against the others"""
+LIKE = 4
+"""Digits that a number which lost its end has in common with the one before"""
 STALL = 1000.0
 """Usual gaps that may lie before a last line"""
 NEAR = 2.0
 """Factor either way by which times may be further apart than the frames of the video: cameras drop frames"""
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)([.,]\d{1,12})?\s*(Z|[+-]\d\d:?\d\d)?")
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)([.,]\d{1,12})?\s*(Z|[+-]\d\d(?::?\d\d)?)?")
 
 _UNIT = re.compile(
     r"(?:^|_)(?:(ns|nsecs?|nanos|nanoseconds?)|(us|usecs?|micros|microseconds?)|(ms|msecs?|millis|milliseconds?)"
@@ -55,8 +57,8 @@ def table_timecodes(
     times = read.times_ns
     _check_last(table, time, times)
     indices = _numbers(table, index, chosen, 0, integer=True) if index else None
-    if rows is not None:
-        unique = indices is not None and len(np.unique(indices)) == len(indices)
+    unique = indices is not None and len(np.unique(indices)) == len(indices)
+    if rows is not None or (indices is not None and unique and np.ptp(indices) == len(indices) - 1):
         order = np.argsort(times if indices is None or not unique else indices, kind="stable")
         times = times[order]
         indices = None if indices is None else indices[order]
@@ -65,7 +67,7 @@ def table_timecodes(
         times, cycle, wraps = unwrapped(times, read.unit_ns)
         notes += wrap_notes(wraps, cycle)
     numbers = counted_from_first(np.arange(len(times)) if indices is None else indices)
-    return Timecodes(times, numbers, cycle, notes=notes)
+    return Timecodes(times, numbers, cycle, labelled=read.labelled, notes=notes)
 
 
 @dataclass(frozen=True)
@@ -76,21 +78,24 @@ class _Read:
     unit_ns: int = 0
     """Of its numbers; 0 where they are no counter"""
     cycle_ns: int = 0
+    labelled: bool = False
     notes: tuple[str, ...] = ()
 
 
 def _check_last(table: Table, name: str, times: np.ndarray) -> None:
-    """Refuse a last line that lost its end and some of its digits with it."""
+    """Refuse a last line that lost some of its digits: it has no end, or begins as the one before does."""
     values = table.columns[name]
-    if table.whole or len(values) < FEWEST_ROWS or len(times) != len(values):
+    if len(values) < FEWEST_ROWS or len(times) != len(values):
         return
     steps = np.diff(times)
     usual = float(np.median(np.abs(steps[:-1])))
-    lost = len(values[-1].as_py()) < len(values[-2].as_py())
+    last, before = values[-1].as_py(), values[-2].as_py()
+    alike = next((at for at, (a, b) in enumerate(zip(last, before, strict=False)) if a != b), len(last))
+    lost = len(last) < len(before) and (not table.whole or alike >= max(LIKE, len(last) // 2))
     if lost and not 0 < steps[-1] <= STALL * max(usual, 1.0):
         raise ValueError(
-            f"{table.place(len(values) - 1)}: the last line is cut short: it has no end, and its time does not go on "
-            "from the one before; copy the file again, or remove that line and the video's last frame"
+            f"{table.place(len(values) - 1)}: the last line is cut short: its time has fewer digits than the one "
+            "before and does not go on from it; copy the file again, or remove that line and the video's last frame"
         )
 
 
@@ -117,7 +122,8 @@ def _times(table: Table, name: str, rows: np.ndarray, rate: Fraction | None, per
     if is_label(first):
         times = read_labels(values.to_pylist(), rate, lambda row: table.place(int(rows[row])))
         assert rate is not None
-        return _Read(times, cycle_ns=day_of(first, rate))
+        notes = counting_notes(values.to_pylist(), rate)
+        return _Read(times, cycle_ns=day_of(first, rate), labelled=True, notes=notes)
     if is_clock(first):
         return _Read(read_clocks(values.to_pylist(), lambda row: table.place(int(rows[row]))), cycle_ns=DAY_NS)
     if _ISO.fullmatch(first):
@@ -135,7 +141,8 @@ def _calendar(table: Table, rows: np.ndarray, values: Sequence[str]) -> np.ndarr
         try:
             if match is None:
                 raise ValueError
-            moment = datetime.fromisoformat(f"{match[1]}T{match[2]}{match[4] or '+00:00'}".replace("Z", "+00:00"))
+            zone = (match[4] or "Z").replace("Z", "+00:00")
+            moment = datetime.fromisoformat(f"{match[1]}T{match[2]}{zone if len(zone) > 3 else zone + ':00'}")
         except ValueError:
             raise ValueError(
                 f"{table.place(int(rows[row]))}: expected a date and time as 2026-11-28T12:34:56.789, got {value!r}"
@@ -161,7 +168,8 @@ def _unit(
         note = f"its times are taken for {fitting[0]}, since its video has a frame every {period_ns / 1e6:.4g} ms"
         return fitting[0], (note,) if usual else ()
     if usual is None:
-        raise ValueError(f"{table.path}: the unit of column {name!r} is open; rename it to {name}_ns, _us, _ms or _s")
+        how = f"rename it to {name}_ns" if table.named else f"begin the file with a line that says {name}_ns"
+        raise ValueError(f"{table.path}: the unit of column {name!r} is open; {how}, _us, _ms or _s")
     return usual, ()
 
 

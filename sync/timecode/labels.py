@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
 
@@ -110,6 +111,22 @@ def labels_to_ns(labels: Sequence[str], rate: Fraction) -> np.ndarray:
 def day_of(label: str, rate: Fraction) -> int:
     """Nanoseconds after which labels like this one start over."""
     return int(frames_to_ns(np.array([frames_per_day(rate, drop_frame=":" not in label.strip()[8:9])]), rate)[0])
+
+
+def counting_notes(labels: Sequence[str], rate: Fraction) -> tuple[str, ...]:
+    """That labels start each second early, and so count at another rate than they are taken to.
+
+    A camera that drops frames loses some labels of a second, not the same last ones of each.
+    """
+    parts = [match for label in labels if (match := _LABEL.fullmatch(label.strip()))]
+    last = [int(a[5]) for a, b in pairwise(parts) if a[3] != b[3]]
+    highest = max((int(part[5]) for part in parts), default=0)
+    if len(last) < 2 or highest + 1 >= round(rate) or sum(number == highest for number in last) * 2 <= len(last):
+        return ()
+    return (
+        f"its labels end each second at :{highest:02}, as {highest + 1} a second do, but are counted at "
+        f"{float(rate):g}; set fps in capture.toml to the rate of the labels, or export them at the video's",
+    )
 
 
 def read_labels(labels: Sequence[str], rate: Fraction | None, place: Callable[[int], str]) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sync.timecode.digits import parse_rig_lines
-from sync.timecode.labels import day_of, is_label, read_labels
+from sync.timecode.labels import counting_notes, day_of, is_label, read_labels
 from sync.timecode.series import Timecodes, counted_from_first, unwrapped, wrap_notes
 from sync.tree import TIME_LIMIT_NS
 
@@ -25,7 +25,8 @@ def read_lines(path: Path, data: bytes, rate: Fraction | None) -> Timecodes | No
         lines = data.decode(errors="replace").rstrip().splitlines()
         times = read_labels(lines, rate, lambda row: f"{path}, line {row + 1}")
         assert rate is not None
-        return Timecodes(times, np.arange(len(lines)), day_of(first, rate))
+        notes = counting_notes(lines, rate)
+        return Timecodes(times, np.arange(len(lines)), day_of(first, rate), labelled=True, notes=notes)
     return None if _NUMBERS.match(first) else _read_rig(path, data)
 
 

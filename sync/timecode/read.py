@@ -72,6 +72,8 @@ def read_text_bytes(path: Path) -> bytes:
     data = path.read_bytes()
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         data = data.decode("utf-16", errors="replace").encode()
+    elif b"\0" in data[:2]:  # without a mark
+        data = data.decode("utf-16-be" if data[0] == 0 else "utf-16-le", errors="replace").encode()
     data = data.removeprefix(b"\xef\xbb\xbf")
     if not data.strip():
         raise ValueError(f"{path} is empty; a camera needs at least one timecode")
@@ -82,7 +84,7 @@ def read_shared_timecodes(
     path: Path,
     cameras: Sequence[str],
     *,
-    rate: Fraction | None = None,
+    rates: Mapping[str, Fraction | None] | None = None,
     column: str | None = None,
     period_ns: Mapping[str, int] | None = None,
 ) -> dict[str, Timecodes]:
@@ -91,7 +93,7 @@ def read_shared_timecodes(
     Raises:
         ValueError: as `read_timecodes`, or two cameras would take the same rows.
     """
-    table, periods = csv_table(path, read_text_bytes(path)), period_ns or {}
+    table, periods, rates = csv_table(path, read_text_bytes(path)), period_ns or {}, rates or {}
     if table.camera is None:
         raise ValueError(f"{path} is shared by all cameras, so one of its columns must be {_either(CAMERA_COLUMNS)}")
     ids = table.cameras
@@ -101,7 +103,7 @@ def read_shared_timecodes(
         if len(twins) > 1:
             raise ValueError(f"{path}: rows of {name!r} would serve cameras {twins}; give the rows the videos' names")
     found = {
-        camera: table_timecodes(table, table.rows_of(name), rate, column, periods.get(camera))
+        camera: table_timecodes(table, table.rows_of(name), rates.get(camera), column, periods.get(camera))
         for camera, name in chosen.items()
     }
     for timecodes in found.values():

@@ -32,6 +32,8 @@ class Timecodes:
     """After so long the numbers start over, as labels do at midnight and counters when they are full; 0: never"""
     source: str = ""
     """Where they come from, for people"""
+    labelled: bool = False
+    """Whether they are labels, which count frames"""
     notes: tuple[str, ...] = ()
     """What had to be assumed or mended to read them, likewise"""
 

@@ -16,6 +16,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pcsv
 
+from sync.timecode.labels import is_clock
+
 CAMERA_COLUMNS = ("cam_id", "camera_id", "camera", "camera_name", "cam", "port")
 NANOSECOND_LIST = "timestamp_ns"
 """Column name that a bare JSON list of whole numbers is given."""
@@ -148,7 +150,7 @@ def json_table(path: Path, data: bytes, column: str | None = None) -> Table:
     text on the way in."""
     try:
         items = json.loads(data, parse_int=str, parse_float=str, parse_constant=str)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no JSON: {error}") from None
     if isinstance(items, dict):  # of columns
         items = _transposed(path, items)
@@ -196,6 +198,8 @@ def _splitter(rows: Sequence[str]) -> Callable[[str], list[str]]:
     for delimiter in (";", "\t"):
         if delimiter in first:
             return lambda row: [cell.strip() for cell in row.split(delimiter)]
+    if is_clock(first):
+        return lambda row: [row]
     if "," in first and not _has_decimal_comma(rows):
         return lambda row: [cell.strip() for cell in row.split(",")]
     if _ISO_START.match(first):

@@ -143,6 +143,7 @@ def write_mvhumannet(rig: Rig, folder: Path) -> None:
 
 def write_smc(rig: Rig, folder: Path) -> None:
     import h5py
+
     with h5py.File(folder / "0007_01_annots.smc", "w") as data:
         for c in rig.cameras:
             pose = np.linalg.inv(c.camera_from_world)

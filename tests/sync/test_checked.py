@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -272,3 +273,69 @@ def test_no_complete_instant_is_an_error() -> None:
     times = np.arange(10) * PERIOD_NS
     with pytest.raises(ValueError, match=r"no instant has a frame of every camera .* c has one at 0 of 10"):
         align({"a": codes(times), "b": codes(times), "c": codes(times + 10**12)}, AlignOptions(reference="a"))
+
+
+# Found by trying
+
+
+def labelled(rate: int, count: int, start: int = 3000) -> str:
+    return "\n".join(frame_to_label(start + k, Fraction(rate)) for k in range(count)) + "\n"
+
+
+def test_labels_count_at_the_rate_of_their_own_video(tmp_path: Path) -> None:
+    """One of 25 beside one of 30, both from 00:01:40:00 on."""
+    folder = make_capture(tmp_path, "videos/a.mp4", "videos/b.mp4")
+    (folder / "timecodes").mkdir()
+    (folder / "timecodes/a.txt").write_text(labelled(30, 60, 3000))
+    (folder / "timecodes/b.txt").write_text(labelled(25, 50, 2500))
+    (folder / "capture.toml").write_text("fps = 30\n")
+    infos = {
+        name: replace(make_info(count), rate=Fraction(rate), pts_ns=np.arange(count) * 10**9 // rate)
+        for name, count, rate in (("a", 60, 30), ("b", 50, 25))
+    }
+    found = load_timecodes(find_capture(folder), infos)
+    for name, rate in (("a", 30), ("b", 25)):
+        assert found[name].times_ns[rate] - found[name].times_ns[0] == 10**9
+    assert found["a"].times_ns[0] == found["b"].times_ns[0] == 100 * 10**9
+    assert found["a"].notes == ()
+    assert "counted at 25 per second" in found["b"].notes[0]
+
+
+@pytest.mark.parametrize(("rate", "said"), [(25, True), (24, True), (30, False)])
+def test_labels_that_start_each_second_early_are_said(tmp_path: Path, rate: int, said: bool) -> None:
+    (tmp_path / "a.txt").write_text(labelled(rate, 90))
+    (tmp_path / "b.csv").write_text("timecode\n" + labelled(rate, 90))
+    for name in ("a.txt", "b.csv"):
+        notes = read_timecodes(tmp_path / name, rate=Fraction(30)).notes
+        assert bool(notes) == said
+        assert not said or f"end each second at :{rate - 1}" in notes[0]
+
+
+def test_rows_in_another_order_are_put_in_that_of_their_index(tmp_path: Path) -> None:
+    rows = [f"{k},{k * PERIOD_NS}" for k in range(9)]
+    (tmp_path / "a.csv").write_text("frame,time_ns\n" + "\n".join(rows[::-1]) + "\n")
+    found = read_timecodes(tmp_path / "a.csv")
+    assert found.times_ns.tolist() == [k * PERIOD_NS for k in range(9)]
+    assert found.indices.tolist() == list(range(9))
+
+
+@pytest.mark.parametrize("suffix", ["csv", "txt"])
+def test_a_last_row_that_lost_digits_before_its_line_break_is_refused(tmp_path: Path, suffix: str) -> None:
+    rows = [str(EPOCH_NS // 1000 + k * 33_333) for k in range(9)]
+    text = ("time_us\n" if suffix == "csv" else "") + "\n".join([*rows[:-1], rows[-1][:-3]]) + "\n"
+    (tmp_path / f"a.{suffix}").write_text(text)
+    with pytest.raises(ValueError, match="the last line is cut short"):
+        read_timecodes(tmp_path / f"a.{suffix}")
+
+
+def test_odd_ways_to_write_times(tmp_path: Path) -> None:
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="is no JSON"):
+        read_timecodes(tmp_path / "deep.json")
+    (tmp_path / "clock.txt").write_text("23:59:59,700\n00:00:00,033\n")
+    assert np.diff(read_timecodes(tmp_path / "clock.txt").times_ns).tolist() == [333_000_000]
+    (tmp_path / "zone.txt").write_text("2026-11-28T12:00:00.5+01\n2026-11-28T11:00:00.6Z\n")
+    assert np.diff(read_timecodes(tmp_path / "zone.txt").times_ns).tolist() == [100_000_000]
+    for encoding in ("utf-16-le", "utf-16-be"):
+        (tmp_path / "wide.csv").write_bytes("time_s\n1.5\n1.6\n".encode(encoding))
+        assert read_timecodes(tmp_path / "wide.csv").times_ns.tolist() == [1_500_000_000, 1_600_000_000]
