@@ -269,7 +269,7 @@ def test_a_rate_that_makes_labels_unreadable_is_seen(data_set):
         (data_set / f"day1/dance/timecodes/cam0{camera}.txt").write_text(labels)
     assert problems(data_set) == {}
     settings = data_set / "day1/dance/capture.toml"
-    settings.write_text(settings.read_text().replace("fps = 30", "fps = 4"))
+    settings.write_text(settings.read_text().replace("fps = 30", "fps = 3"))
     assert len(problems(data_set)) == 5
 
 
