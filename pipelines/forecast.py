@@ -303,7 +303,8 @@ def expected_iterations(options: SequenceOptions) -> float:
 def _costs(size: Size, options: SequenceOptions, machine: Machine) -> dict[str, float]:
     """Seconds of each kind of work. Never more segments at once than there are."""
     step, at_once = machine.probe.step(fit_size(size, options)), min(machine.jobs, _segments(size))
-    each = {kind: seconds * machine.pace for kind, seconds in SECONDS.items()}
+    looked = machine.probe.picture_seconds is not None  # which tells the pace of decoding and motion itself
+    each = {kind: seconds * (1 if kind == "flow" and looked else machine.pace) for kind, seconds in SECONDS.items()}
     each |= {kind: share * step for kind, share in STEPS.items()}
     work = work_of(size, options, machine.probe)
     return {kind: each[kind] * work[kind] / (at_once if kind in PER_SEGMENT else 1) for kind in work}
