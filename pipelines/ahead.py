@@ -6,33 +6,21 @@ Looks at captures and stores, and changes neither; only the seconds' look at the
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from packuv.lpips import lacking
 from packuv.progress import Progress, no_progress
+from pipelines.choice import affordable, check_judges
 from pipelines.disk import free_bytes
 from pipelines.events import Event, Journal
-from pipelines.forecast import Forecast, Machine, Size, forecast, machine_of, question_of, size_of
+from pipelines.forecast import Forecast, Size, forecast, machine_of, question_of, size_of
 from pipelines.options import SequenceOptions
-from pipelines.process import (
-    Engine,
-    There,
-    affordable_points,
-    find_sequence,
-    jobs_at_once,
-    jobs_of,
-    options_of,
-    plan_of,
-    prepare,
-    settle,
-)
+from pipelines.process import find_sequence, jobs_at_once, jobs_of, options_of, plan_of, points_of, walk
 from pipelines.request import STAGES, RunRequest
 from pipelines.space import check_room, missing_bytes
 from pipelines.stages import Made
 from sync.capture import Capture
-from tasks.artefacts.jobs import CancelledError
 from tasks.artefacts.store import Store
 from tasks.stages.plan import Plan
 
@@ -97,47 +85,32 @@ class Ahead:
         return free_bytes(self.root)
 
 
-def look_ahead(request: RunRequest, *, machine: Machine | None = None, progress: Progress = no_progress) -> Ahead:
-    """What this request would do now. Raises ValueError or FileNotFoundError for bad input.
-
-    `machine` is one that was looked at before, for a run of the same size and settings.
-    """
+def look_ahead(request: RunRequest, *, progress: Progress = no_progress) -> Ahead:
+    """What this request would do now. Raises ValueError or FileNotFoundError for bad input."""
     capture, jobs = find_sequence(request), jobs_of(request)
     plan = plan_of(request, capture)
-    size = size_of(capture, plan)
-    chosen = affordable_points(request, jobs)
-    point = chosen[-1].name if chosen else request.preset
-    options = options_of(request, capture, point)
+    check_judges(request, plan.held_out)
+    size, points = size_of(capture, plan), points_of(request, capture)
     root = Path(request.out) / capture.name / "store"
-    if machine is None:
-        question = question_of(plan, size, (options,))
-        machine = machine_of(root.parent, question, jobs, jobs_at_once(request), afresh=not chosen, progress=progress)
+    asked = points or {request.preset: options_of(request, capture, request.preset)}
+    question = question_of(plan, size, tuple(asked.values()))
+    machine = machine_of(root.parent, question, jobs, jobs_at_once(request), afresh=not points, progress=progress)
+    chosen = affordable(request, points, size, machine) if points else ()
+    point = chosen[-1].name if chosen else request.preset
+    options, journal = asked[point], Journal()
     expected = forecast(size, options, machine, request.stop_after)
-    made, events = _there(request) if root.is_dir() else (Made(), ())
+    made = walk(request, chosen, journal)[0] if root.is_dir() else Made()
     return Ahead(
         capture.name,
         point,
         size,
         tuple(_steps(expected, made, Store(root))),
-        tuple(dict.fromkeys([*_spared(capture, plan, options), *_skips(events)])),
-        tuple(_unknown(capture, chosen != ())),
+        tuple(dict.fromkeys([*_spared(capture, plan, options), *_skips(journal.events)])),
+        tuple(_unknown(capture, request.target_psnr is not None)),
         expected,
         machine.probe.moving,
         root,
     )
-
-
-def _there(request: RunRequest) -> tuple[Made, Sequence[Event]]:
-    """What of a run is there, up to the first artefact that is not, and what it told."""
-    jobs, journal = jobs_of(request), Journal()
-    points = affordable_points(request, jobs)
-    jobs.cancel("only looking")
-    engine = Engine(lambda make: lambda stage: There(make(stage)))
-    sequence, run = prepare(request, journal, engine, jobs, points)
-    with suppress(CancelledError):  # at the first that is not there
-        sequence, run = settle(sequence, run, engine, points)
-        sequence.run(request.stop_after)
-    return run.made, journal.events
 
 
 def _steps(expected: Forecast, made: Made, store: Store) -> Iterator[Step]:

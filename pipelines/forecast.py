@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from packuv.budget import USUAL_BYTES
 from packuv.fit.pace import FitSize
 from packuv.motion.step import fitted_size
 from packuv.progress import Progress, no_progress
@@ -121,7 +122,7 @@ class Machine:
     """Of a job with its share of the cores"""
     jobs: int = 1
     """Segments at once"""
-    memory_bytes: int = 2_000_000_000
+    memory_bytes: int = USUAL_BYTES
     """That a job may fill with pictures and layers"""
 
     @property
@@ -176,12 +177,18 @@ def minutes_text(minutes: float) -> str:
 
 def size_of(capture: Capture, plan: Plan) -> Size:
     """Of what a plan means to process; reads the videos' packets. Raises what `probe_video` raises."""
-    videos = probe_capture(capture)
-    longest = max(video.frame_count for video in videos.values())
+    return size_told(
+        {name: (video.width, video.height, video.frame_count) for name, video in probe_capture(capture).items()}, plan
+    )
+
+
+def size_told(videos: Mapping[str, tuple[int, int, int]], plan: Plan) -> Size:
+    """The same where width, height and number of frames of each video are known. Raises ValueError without frames."""
+    longest = max(frames for _, _, frames in videos.values())
     frames = min(longest, plan.stop or longest) - plan.first
     if frames < 1:
         raise ValueError(f"the capture has {longest} instants, so none from {plan.first} on")
-    sides = {name: (video.width, video.height) for name, video in videos.items()}
+    sides = {name: (width, height) for name, (width, height, _) in videos.items()}
     return Size(frames, tuple(sides[name] for name in plan.fitted), tuple(sides[name] for name in plan.held_out))
 
 

@@ -22,7 +22,7 @@ from pipelines.choice import PILOT_FRAMES, Affordable, Priced, affordable, check
 from pipelines.crew import CORES_PER_JOB, crew_of
 from pipelines.events import Event, Journal
 from pipelines.folder import claim
-from pipelines.forecast import Forecast, Guess, Machine, forecast, machine_of, question_of, size_of
+from pipelines.forecast import Forecast, Guess, Machine, forecast, machine_of, question_of, size_of, size_told
 from pipelines.ladder import up_to
 from pipelines.lender import lender_of
 from pipelines.options import SequenceOptions, compose
@@ -46,6 +46,7 @@ from tasks.report.write import write_report
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import METRICS
 from tasks.stages.plan import Plan
+from tasks.stages.synchronize import read_videos
 
 PARTIAL = "scene.partial.mkv"
 FORECAST = "forecast"
@@ -159,11 +160,13 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
         folder, sequence=run.name, capture=request.capture, preset=request.preset, engine=engine.place
     )
     flow_run = engine.place.flow_run if engine.place else None
+    expected = list[Forecast]()
     with workshop.store.in_use(), on_record as register, journal.heard_by(register):
         try:
             sequence, run = settle(sequence, run, engine, affordable)
-            run = replace(run, forecast=foreseen(run, journal))
-            sequence.run(request.stop_after)
+            whole = replace(sequence, synchronized=partial(foresee, run, journal, expected))
+            whole.run(request.stop_after)
+            run = replace(run, forecast=next(iter(expected), None))
             outcome = _publish(run, folder)
         except BaseException as error:
             jobs.cancel()
@@ -178,33 +181,29 @@ def process(request: RunRequest, journal: Journal, engine: Engine, jobs: Jobs) -
         return outcome
 
 
-def foreseen(run: Run, journal: Journal) -> Forecast | None:
-    """What the run will take, had nothing been there; None where that is not worth a look, or others do the work."""
+def foresee(run: Run, journal: Journal, expected: list[Forecast], groups: Key) -> None:
+    """Add what the run will take, had nothing been there; nothing where that is not worth a look, or others do the
+    work. A look that fails is told, and ends no run."""
     if run.request.cluster is not None:
-        return None
-    try:
-        found = _foreseen(run, journal)
-    except (ValueError, OSError, JobError) as error:  # what is wrong with the capture, the stages say better
-        journal.told(FORECAST, f"none: {error}")
-        return None
-    if found is not None:
-        journal.told(FORECAST, found.told)
-    return found
-
-
-def _foreseen(run: Run, journal: Journal) -> Forecast | None:
+        return
     jobs, folder = run.workshop.jobs, run.workshop.store.root.parent
-    size, at_once = size_of(run.workshop.capture, run.plan), jobs_at_once(run.request)
+    videos = read_videos(run.workshop.path(groups))
+    told = {name: (video["width"], video["height"], video["frames"]) for name, video in videos.items()}
+    size, at_once = size_told(told, run.plan), jobs_at_once(run.request)
     question = question_of(run.plan, size, (run.options,))
     rough = forecast(size, run.options, Machine(Guess(), at_once), run.request.stop_after)
     if rough.minutes < WORTH_MINUTES and remembered(folder, question, jobs) is None:
-        return None
+        return
     journal.started(FORECAST)
     try:
         machine = machine_of(folder, question, jobs, at_once, progress=partial(journal.moved, FORECAST))
+        expected.append(forecast(size, run.options, machine, run.request.stop_after))
+    except (ValueError, OSError, JobError) as error:
+        journal.told(FORECAST, f"none: {error}")
+    else:
+        journal.told(FORECAST, expected[0].told)
     finally:
         journal.ended(FORECAST)
-    return forecast(size, run.options, machine, run.request.stop_after)
 
 
 def is_made(request: RunRequest) -> bool:
@@ -212,11 +211,23 @@ def is_made(request: RunRequest) -> bool:
     jobs = jobs_of(request)
     jobs.cancel("only looking")
     try:
-        engine, affordable = Engine(lambda make: lambda stage: There(make(stage))), affordable_points(request, jobs)
-        settle(*prepare(request, Journal(), engine, jobs, affordable), engine, affordable)[0].run(request.stop_after)
+        return walk(request, affordable_points(request, jobs), Journal())[1]
     except Exception:  # whatever it is, the run itself meets it again
         return False
-    return True
+
+
+def walk(request: RunRequest, affordable: Affordable, journal: Journal) -> tuple[Made, bool]:
+    """What of a run is there, up to the first artefact that is not, and whether that is all; makes nothing."""
+    jobs = jobs_of(request)
+    jobs.cancel("only looking")
+    engine = Engine(lambda make: lambda stage: There(make(stage)))
+    sequence, run = prepare(request, journal, engine, jobs, affordable)
+    try:
+        sequence, run = settle(sequence, run, engine, affordable)
+        sequence.run(request.stop_after)
+    except CancelledError:
+        return run.made, False
+    return run.made, True
 
 
 @dataclass(frozen=True)
@@ -234,15 +245,22 @@ def affordable_points(request: RunRequest, jobs: Jobs) -> Affordable:
 
     Raises ValueError where not even the fastest fits into the time, or an error is asked for and no camera held out.
     """
-    if request.max_minutes is None and request.target_psnr is None:
-        return ()
     capture = find_sequence(request)
+    points = points_of(request, capture)
+    if not points:
+        return ()
     plan = plan_of(request, capture)
     check_judges(request, plan.held_out)
     folder, size = Path(request.out) / capture.name, size_of(capture, plan)
-    points = {point: options_of(request, capture, point) for point in up_to(request.preset)}
     machine = machine_of(folder, question_of(plan, size, tuple(points.values())), jobs, jobs_at_once(request))
     return affordable(request, points, size, machine)
+
+
+def points_of(request: RunRequest, capture: Capture) -> dict[str, SequenceOptions]:
+    """Points among which a time or an error that is asked for chooses, from fast to fine; none where neither is."""
+    if request.max_minutes is None and request.target_psnr is None:
+        return {}
+    return {point: options_of(request, capture, point) for point in up_to(request.preset)}
 
 
 def options_of(request: RunRequest, capture: Capture, point: str) -> SequenceOptions:

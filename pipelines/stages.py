@@ -7,6 +7,7 @@ would keep that worker from working.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -78,6 +79,8 @@ class Sequence:
     """Somebody may look at pictures of what is fitted before all is"""
     judged: PictureOptions | None = None
     """How large the pictures are on which scores are measured; None: as those that are fitted"""
+    synchronized: Callable[[Key], object] = lambda groups: None
+    """Hears of the groups when they are there"""
 
     def run(self, stop_after: str) -> None:
         """Have every artefact up to the stage `stop_after`, noting each in `made`.
@@ -137,6 +140,7 @@ class Sequence:
         find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
         groups = self._make(synchronize(self.workshop, self.options.sync))
         check_space(self.workshop, self.plan, self.options, groups)
+        self.synchronized(groups)
 
     def _calibrate(self) -> None:
         groups, plan = self.made.only("sync"), self.plan

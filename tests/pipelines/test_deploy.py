@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ import pytest
 from pipelines.deploy import ServeOptions
 from pipelines.register import find_runs
 from tests.support.places import ROOT
+from tests.support.pool import wait_for
 
 CAPTURE = ROOT / "tests" / "golden" / "capture"
 PREFECT = Path(sys.executable).with_name("prefect")
@@ -69,15 +69,6 @@ class Api:
         return lambda: self.run(run)["state"]["type"] in ("COMPLETED", "FAILED", "CANCELLED", "CRASHED")
 
 
-def wait_for(what: Callable[[], Any], seconds: float = 180) -> Any:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        if found := what():
-            return found
-        time.sleep(0.5)
-    pytest.fail(f"waited {seconds} s for {what}")
-
-
 @pytest.fixture(scope="module")
 def served(tmp_path_factory) -> Iterator[tuple[Api, Path]]:
     """`packuv serve`, and its output folder."""
@@ -101,7 +92,7 @@ def served(tmp_path_factory) -> Iterator[tuple[Api, Path]]:
             except OSError:
                 return False
 
-        wait_for(ready)
+        wait_for(ready, seconds=180)
         yield api, out
         process.send_signal(signal.SIGTERM)
         try:
@@ -130,7 +121,7 @@ def test_the_form_documents_every_field_and_refuses_what_is_wrong(served):
 def test_json_starts_a_run_that_bears_its_name_and_leaves_its_tables(served):
     api, out = served
     run = api.start("on-demand", capture=str(CAPTURE), out=str(out), preset="draft", stop_after="sync")
-    wait_for(api.ended(run))
+    wait_for(api.ended(run), seconds=180)
     found = api.run(run)
     assert found["state"]["type"] == "COMPLETED", found["state"]["message"]
     name = json.loads((next(out.glob("*/run.json"))).read_text())["sequence"]
@@ -160,7 +151,7 @@ def test_cancel_on_the_dashboard_ends_the_work_within_seconds(served):
         stages = [stage.label for found in find_runs(folder) for stage in found.record.stages]
         return any(label.startswith("fit") for label in stages)
 
-    wait_for(fitting)
+    wait_for(fitting, seconds=180)
     api(f"/flow_runs/{run}/set_state", {"state": {"type": "CANCELLING", "name": "Cancelling"}})
     wait_for(lambda: not [found for found in find_runs(folder) if found.alive], seconds=20)
     wait_for(api.ended(run), seconds=20)
@@ -199,7 +190,7 @@ def test_a_worker_runs_what_prefect_yaml_deploys(served, tmp_path):
     ) as worker:
         try:
             run = api.start("from-yaml", capture=str(CAPTURE), out=str(out), name="worked", stop_after="sync")
-            wait_for(api.ended(run))
+            wait_for(api.ended(run), seconds=180)
         finally:
             worker.kill()  # asked gently, it may take minutes
     assert api.run(run)["state"]["type"] == "COMPLETED"
