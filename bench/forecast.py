@@ -27,14 +27,15 @@ from tasks.artefacts.retention import RUN
 from tasks.stages.encode import SCENE
 
 
-def gather(folder: Path) -> dict[str, Any]:
-    """Probe and facts of the run in `folder`, <out>/<sequence>. Raises FileNotFoundError where nobody looked."""
+def gather(folder: Path) -> tuple[dict[str, Any], SequenceOptions]:
+    """Probe and facts of the run in `folder`, <out>/<sequence>, and its options. Raises FileNotFoundError where nobody
+    looked."""
     run, probe = json.loads((folder / RUN).read_text()), json.loads((folder / PROBE).read_text())["found"]
     request = request_of(run)
     capture = find_sequence(request)
     size = size_of(capture, plan_of(request, capture))
     made = run["artefacts"]
-    return {
+    row = {
         "run": f"{run['sequence']} {request.preset}",
         "preset": request.preset,
         "settings": run["request"]["settings"],
@@ -46,6 +47,7 @@ def gather(folder: Path) -> dict[str, Any]:
         "disk_bytes": sum(item["bytes"] for item in made),
         "scene_bytes": (folder / SCENE).stat().st_size,
     }
+    return row, options_of(request, capture, request.preset)
 
 
 def request_of(run: Mapping[str, Any]) -> RunRequest:
@@ -65,11 +67,11 @@ def _seconds(made: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, float]]:
         yield stage, sum(item["seconds"] for item in made if GROUPS[item["artefact"].partition("/")[0]] == stage)
 
 
-def table(rows: Sequence[Mapping[str, Any]], options: Mapping[str, SequenceOptions]) -> str:
+def table(gathered: Sequence[tuple[Mapping[str, Any], SequenceOptions]]) -> str:
     """In Markdown: forecast, fact, and their ratio in per cent."""
     lines = ["| run | | forecast | fact | off by |", "|---|---|---:|---:|---:|"]
-    for row in rows:
-        found = forecast_of(row, options[row["run"]])
+    for row, options in gathered:
+        found = forecast_of(row, options)
         pairs = {stage: (seconds / 60, row["seconds"][stage] / 60) for stage, seconds in found.seconds.items()}
         pairs["all, min"] = found.minutes, row["minutes"]
         pairs["memory, GB"] = found.memory_bytes / 1e9, row["memory_bytes"] / 1e9
@@ -97,13 +99,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="folders of finished runs: <out>/<sequence>")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write; the table goes beside it as .md")
     given = parser.parse_args(arguments)
-    rows, options = list[dict[str, Any]](), dict[str, SequenceOptions]()
-    for folder in given.runs:
-        rows.append(gather(folder))
-        request = request_of(json.loads((folder / RUN).read_text()))
-        options[rows[-1]["run"]] = options_of(request, find_sequence(request), request.preset)
+    gathered = [gather(folder) for folder in given.runs]
+    rows = [row for row, _ in gathered]
     given.out.write_text(json.dumps(rows, indent=1) + "\n")
-    found = table(rows, options)
+    found = table(gathered)
     given.out.with_suffix(".md").write_text(found + "\n")
     print(found)
 
