@@ -49,13 +49,13 @@ def same_name(first: str, second: str) -> bool:
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key that reads digits as numbers, as `sync.capture` sorts cameras.
+    """Sort key that reads digits as numbers, and upper case as lower case, as `sync.natural` sorts cameras.
 
-    >>> sorted(["cam10", "cam2", "cam1b"], key=natural_key)
-    ['cam1b', 'cam2', 'cam10']
+    >>> sorted(["cam10", "CAM2", "cam1b"], key=natural_key)
+    ['cam1b', 'CAM2', 'cam10']
     """
     parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(part), part) if part[0].isdecimal() else (1, 0, part) for part in parts)
+    return tuple((0, int(part), part) if part[0].isdecimal() else (1, 0, part.casefold()) for part in parts)
 
 
 def some(names: Iterable[str]) -> str:
