@@ -66,9 +66,11 @@ def run_flow(request: RunRequest, journal: Journal, link: Link) -> Outcome:
     """Run the flow here. Raises what `process` raises."""
     ended = list[Outcome]()
     sequence = sequence_flow(lambda: journal, lambda: link, ended=ended.append)
-    state: State[Outcome] = sequence(request, return_state=True)
-    send_what_is_left()
-    link.close()
+    try:
+        state: State[Outcome] = sequence(request, return_state=True)
+    finally:  # else, after Ctrl-C, the link would take the end of our own server for a fault
+        send_what_is_left()
+        link.close()
     if state.is_cancelled():
         raise CancelledError(state.message)
     return ended[0] if ended else state.result()
