@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,31 @@ def save_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Arrays by name, not compressed."""
     with whole_file(path) as partial, partial.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]  # its stub takes them for allow_pickle
+
+
+_HEADERS = RLock()
+# NumPy parses headers by syntax trees. Where two threads of Python before 3.11.8 build some at once, one now and then
+# fails with "AST constructor recursion depth mismatch" (CPython issue 106905).
+
+
+def load_npy(path: Path) -> np.ndarray:
+    """The array of a file; threads may read at once."""
+    with _HEADERS:
+        array: np.ndarray = np.load(path, allow_pickle=False)
+        return array
+
+
+def map_npy(path: Path) -> np.memmap[Any, Any]:
+    """The array of a file, mapped into memory to be read; threads may map at once."""
+    with _HEADERS:
+        return np.lib.format.open_memmap(path, mode="r")
+
+
+@contextmanager
+def open_npz(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
+    """The arrays of a file by name, each read when it is asked for; one thread at a time."""
+    with _HEADERS, np.load(path, allow_pickle=False) as arrays:
+        yield arrays
 
 
 @contextmanager

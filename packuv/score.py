@@ -20,7 +20,7 @@ import pyarrow as pa
 
 from packuv.camera import PinholeCamera
 from packuv.colour import GAMMA, OFFSET, linear_from_srgb, lit, srgb_from_linear
-from packuv.files import save_json, save_npz, whole_file
+from packuv.files import open_npz, save_json, save_npz, whole_file
 from packuv.footage import Views
 from packuv.footage.planes import as_planes
 from packuv.gaussians.floats import Gaussians
@@ -212,13 +212,13 @@ class _Part:
 
     def moved(self, camera: int) -> np.ndarray | None:
         """bool [rows, BLOCKS]: something moved there; None where no two pictures follow one another."""
-        with np.load(self._places) as arrays:
+        with open_npz(self._places) as arrays:
             found: np.ndarray | None = arrays.get(f"moved_{camera}")
             return found
 
     def finished(self, names: Sequence[str], still: Sequence[np.ndarray | None]) -> Iterator[Score]:
         """The scores, with those of the places where nothing ever moves, bool [rows, BLOCKS] by camera."""
-        with np.load(self._places) as arrays:
+        with open_npz(self._places) as arrays:
             levels = {
                 name: iter(_still_levels(arrays[f"blocks_{camera}"], still[camera]))
                 for camera, name in enumerate(names)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from packuv.each import as_bits
-from packuv.files import save_json, save_npz
+from packuv.files import open_npz, save_json, save_npz
 from packuv.fit.backdrop import Backdrop
 from packuv.fit.keyframe import DEAD_CODE, KeyState
 from packuv.fit.lift import lift_motion
@@ -166,10 +166,10 @@ class Track:
 
     def _load(self, figures: list[dict[str, Any]]) -> None:
         count = len(figures)
-        with np.load(self._scratch / f"state_{count:06d}.npz") as data:
+        with open_npz(self._scratch / f"state_{count:06d}.npz") as data:
             self.model.overwrite(np.arange(len(self.model)), Gaussians(*(data[name] for name in ATTRIBUTES)))
             self._changed = data["changed"]
         for number in range(1, count + 1):
-            with np.load(self._scratch / f"frame_{number:06d}.npz") as data:
+            with open_npz(self._scratch / f"frame_{number:06d}.npz") as data:
                 self.frames.append(Codes(data["xyz"], data["attributes"]))
         self.figures = figures

@@ -25,7 +25,7 @@ import numpy as np
 from packuv.budget import Budget
 from packuv.camera import PinholeCamera
 from packuv.each import Each, as_bits, packed
-from packuv.files import save_json, save_npz
+from packuv.files import open_npz, save_json, save_npz
 from packuv.fit.backdrop import Backdrop, joined
 from packuv.fit.bands import Judgement, drop_bands, judge, left_out, still_bands
 from packuv.fit.model import Model
@@ -98,7 +98,7 @@ class KeyState:
     def load(cls, folder: Path) -> KeyState:
         data = json.loads((folder / "key.json").read_text())
         bounds = Bounds(np.array(data["bounds"]["centre"]), data["bounds"]["radius"], data["bounds"]["near"])
-        with np.load(folder / "state.npz") as arrays:
+        with open_npz(folder / "state.npz") as arrays:
             gaussians = Gaussians(*(arrays[name] for name in ATTRIBUTES))
         quantizer = Quantizer.from_json(data["quantizer"])
         return cls(data["instant"], gaussians, data["backdrop"], quantizer, bounds, data["figures"])

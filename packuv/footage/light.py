@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from packuv.bounds import MOST_FRAMES, MOST_LIGHT, shown
-from packuv.files import save_npz
+from packuv.files import open_npz, save_npz
 from packuv.footage.ratios import Ratios, measure_ratios
 from packuv.footage.reader import FrameReader
 from packuv.progress import Progress, no_progress
@@ -108,7 +108,7 @@ class Light:
     @classmethod
     def load(cls, path: Path) -> Light:
         """Inverse of `save`, but for the facts."""
-        with np.load(path) as arrays:
+        with open_npz(path) as arrays:
             names = arrays["cameras"].tolist()
             return cls(arrays["light"], dict(zip(names, arrays["exposures"], strict=True)))
 

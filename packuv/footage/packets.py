@@ -11,7 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from packuv.files import save_npz
+from packuv.files import open_npz, save_npz
 from packuv.footage.coding import Coding
 from packuv.footage.pictures import first_coding, picture_names
 
@@ -127,7 +127,7 @@ def _demuxed(container: av.container.InputContainer, stream: av.VideoStream) -> 
 
 
 def _loaded(table: Path) -> np.ndarray:
-    with np.load(table) as data:
+    with open_npz(table) as data:
         times: np.ndarray = data["times"]
         return times
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from packuv.colour import GAMMA, OFFSET
-from packuv.files import save_npz
+from packuv.files import open_npz, save_npz
 from packuv.kernels.compile import kernel
 from packuv.progress import Progress, no_progress
 
@@ -65,7 +65,7 @@ class Ratios:
         """Take over what `keep` wrote; whether there is such a file."""
         if not path.exists():
             return False
-        with np.load(path) as measured:
+        with open_npz(path) as measured:
             self.whole[instants], self.parts[instants] = measured["whole"], measured["parts"]
         return True
 

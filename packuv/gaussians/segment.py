@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from packuv.files import open_npz
 from packuv.gaussians.codes import Codes
 
 
@@ -68,7 +69,7 @@ class Segment:
 
     @classmethod
     def load(cls, path: Path) -> Segment:
-        with np.load(path) as data:
+        with open_npz(path) as data:
             return cls(
                 int(data["first"]),
                 Codes(data["key_xyz"], data["key_attributes"]),

@@ -15,7 +15,7 @@ from typing import overload
 import numpy as np
 
 from packuv.budget import Budget
-from packuv.files import save_npz
+from packuv.files import open_npz, save_npz
 from packuv.footage import Views
 from packuv.progress import Progress, no_progress
 
@@ -103,8 +103,9 @@ class Stills(Sequence[Still]):
     """Backgrounds in a file."""
 
     def __init__(self, path: Path, budget: Budget | None) -> None:
-        self._data, self._budget = np.load(path), budget
-        self._cameras = [int(camera) for camera in self._data["cameras"]]
+        self._path, self._budget = path, budget
+        with open_npz(path) as arrays:
+            self._cameras = [int(camera) for camera in arrays["cameras"]]
         self._kept: dict[int, Still] = {}
 
     def __len__(self) -> int:
@@ -120,7 +121,8 @@ class Stills(Sequence[Still]):
         camera = self._cameras[index]
         if camera in self._kept:
             return self._kept[camera]
-        still = Still(camera, self._data[f"pixels_{camera}"], self._data[f"known_{camera}"])
+        with open_npz(self._path) as arrays:
+            still = Still(camera, arrays[f"pixels_{camera}"], arrays[f"known_{camera}"])
         if self._budget is None or self._budget.take(still.pixels.nbytes + still.known.nbytes):
             self._kept[camera] = still
         return still

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.files import save_json
+from packuv.files import load_npy, map_npy, save_json
 from packuv.footage import Views
 from packuv.motion.step import (
     MotionOptions,
@@ -163,7 +163,7 @@ class _CameraFiles:
             empty = np.full(instants, np.array((UNFINISHED, np.nan, np.nan, np.nan), dtype=STEP_RECORD))
             np.save(steps.with_suffix(".scratch.npy"), empty)
             os.replace(steps.with_suffix(".scratch.npy"), steps)
-        unfinished = np.flatnonzero(np.load(steps)["previous"] == UNFINISHED)
+        unfinished = np.flatnonzero(load_npy(steps)["previous"] == UNFINISHED)
         self.finished = int(unfinished[0]) if len(unfinished) else instants
         """Instants measured when the files were opened, from the first on"""
         self._steps, self._masks = _Rows(steps), _Rows(masks)
@@ -206,7 +206,7 @@ class _Rows:
     up, and a full disk would end the process without a word."""
 
     def __init__(self, path: Path) -> None:
-        header = np.load(path, mmap_mode="r")
+        header = map_npy(path)
         self._dtype, self._offset, self._row_bytes = header.dtype, header.offset, header[:1].nbytes
         self._file = path.open("r+b")
 
@@ -253,7 +253,7 @@ class MotionCache:
         names = tuple(camera["name"] for camera in recipe["cameras"])
         if any(not _paths(folder, name)[0].exists() for name in names):
             raise ValueError(f"the motion measurement in {folder} was cut off; run it again to complete it")
-        steps = np.stack([np.load(_paths(folder, name)[0]) for name in names], axis=1)  # [T, C]
+        steps = np.stack([load_npy(_paths(folder, name)[0]) for name in names], axis=1)  # [T, C]
         if missing := int((steps["previous"] == UNFINISHED).sum()):
             raise ValueError(f"{missing} of {steps.size} pictures in {folder} are not measured; run it again")
         sizes = tuple((camera["width"], camera["height"]) for camera in recipe["cameras"])
@@ -321,7 +321,4 @@ class MotionCache:
         """Memory maps per camera: masks uint8 [T, hm, ceil(wm / 8)], optical flow float16 [T, h, w, 2]."""
         empty = np.empty((0, 0, 0, 2), dtype=np.float16)
         paths = [_paths(self.folder, name) for name in self.names]
-        return [
-            (np.load(masks, mmap_mode="r"), np.load(vectors, mmap_mode="r") if self.options.keep_flow else empty)
-            for _, masks, vectors in paths
-        ]
+        return [(map_npy(masks), map_npy(vectors) if self.options.keep_flow else empty) for _, masks, vectors in paths]

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from packuv.files import save_npz
+from packuv.files import open_npz, save_npz
 from packuv.footage import Views
 from packuv.motion.background import apart, median_of
 from packuv.motion.step import fitted_size
@@ -102,7 +102,7 @@ class Patches:
 
     @classmethod
     def load(cls, path: Path) -> Patches:
-        with np.load(path) as data:
+        with open_npz(path) as data:
             found = [Patch(int(date), dict(_masks(data, number))) for number, date in enumerate(data["dates"])]
             return cls(tuple(found), tuple(int(cut) for cut in data["cuts"]))
 

@@ -19,7 +19,7 @@ from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
 from calibration.turned import fitted
-from packuv.files import save_json
+from packuv.files import map_npy, save_json
 from sync.align import FrameGroups
 from sync.capture import Capture, find_capture
 from tasks.artefacts.stage import Files, Notes, Stage, Work
@@ -309,8 +309,7 @@ class _KeptPictures:
     def load(self) -> list[dict[str, np.ndarray]]:
         """All of them by instant, mapped into memory."""
         return [
-            {name: np.load(self._path(index, name), mmap_mode="r") for name in names}
-            for index, names in enumerate(self._instants)
+            {name: map_npy(self._path(index, name)) for name in names} for index, names in enumerate(self._instants)
         ]
 
     def _path(self, instant: int, camera: str) -> Path:

@@ -2,9 +2,36 @@
 
 from __future__ import annotations
 
+import ast
+import time
+from concurrent.futures import ThreadPoolExecutor
+from threading import Lock
+
+import numpy as np
 import pytest
 
-from packuv.files import whole_file, whole_folder
+from packuv.files import load_npy, map_npy, open_npz, save_npz, whole_file, whole_folder
+
+
+def test_threads_that_read_arrays_take_turns_at_their_headers(tmp_path, monkeypatch):
+    """Python before 3.11.8 fails where two threads build syntax trees at once, as NumPy does of headers."""
+    np.save(tmp_path / "a.npy", np.arange(6))
+    save_npz(tmp_path / "a.npz", {"a": np.arange(6)})
+    inside, parse = Lock(), ast.literal_eval
+
+    def parsed_alone(text):
+        assert inside.acquire(blocking=False)
+        time.sleep(1e-3)
+        inside.release()
+        return parse(text)
+
+    def read(number):
+        with open_npz(tmp_path / "a.npz") as arrays:
+            return (map_npy if number % 2 else load_npy)(tmp_path / "a.npy").sum() + arrays["a"].sum()
+
+    monkeypatch.setattr(ast, "literal_eval", parsed_alone)
+    with ThreadPoolExecutor(8) as pool:
+        assert set(pool.map(read, range(40))) == {30}
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
