@@ -28,7 +28,7 @@ from pipelines import plugins
 from pipelines.commands.output import check_written, lasting_output
 from pipelines.disk import free_bytes, size_text
 from pipelines.ending import Terminated, ending_gently
-from pipelines.request import BAD_INPUT, PRESETS, QUALITIES, STAGES, parse_range
+from pipelines.request import BAD_INPUT, CLOCKS, PRESETS, QUALITIES, STAGES, parse_range
 from tasks.artefacts.jobs import ONE_BLAS_THREAD, CancelledError
 
 OK, FAILED, WRONG, INTERRUPTED = 0, 1, 2, 130
@@ -339,6 +339,12 @@ def _how(command: argparse.ArgumentParser, *, stop: bool) -> None:
     )
     command.add_argument("--quality", choices=QUALITIES, default="lossless", help="how near the file stays to the fit")
     command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what fits and renders")
+    command.add_argument(
+        "--clock",
+        choices=CLOCKS,
+        default=None,
+        help="what times are worth, whatever capture.toml says; content: nothing, so pictures tell when each camera began",
+    )
     command.add_argument(
         "--frames", type=_range_text, default=":", metavar="A:B", help="instants A to B - 1, counted from 0 (all)"
     )

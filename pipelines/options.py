@@ -11,9 +11,11 @@ from packuv.footage import LightOptions, Transfer
 from packuv.motion import KeyframeOptions, MotionOptions, PatchOptions
 from packuv.scene import TOLERANCES, EncodeOptions, Quality
 from pipelines.ladder import LADDER
-from pipelines.request import QUALITIES
+from pipelines.request import CLOCKS, QUALITIES
 from sync.align import AlignOptions
 from sync.capture import TRANSFERS, CaptureSettings
+from sync.clock import ClockMode
+from sync.content import ContentOptions
 from tasks.artefacts.recipe import override
 from tasks.stages.calibrate import PointOptions, RigOptions
 from tasks.stages.evaluate import EvaluateOptions
@@ -30,6 +32,7 @@ class SequenceOptions:
     light: LightOptions = field(default_factory=LightOptions)
     points: PointOptions = field(default_factory=PointOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
+    content: ContentOptions = field(default_factory=ContentOptions)
     patches: PatchOptions = field(default_factory=PatchOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
@@ -38,6 +41,7 @@ class SequenceOptions:
 
 
 assert tuple(Quality) == QUALITIES
+assert tuple(ClockMode) == CLOCKS
 assert tuple(Transfer) == TRANSFERS
 
 

@@ -18,6 +18,7 @@ Device = Literal["auto", "cpu", "cuda"]
 LastStage = Literal["sync", "calibrate", "flow", "fit", "encode", "verify", "evaluate", "report"]
 PRESETS = get_args(Preset)
 QUALITIES = get_args(Fidelity)
+CLOCKS = ("trusted", "triggered", "content")
 """How near the scene file stays to the fit, see `packuv.scene.encoder.TOLERANCES`"""
 STAGES = get_args(LastStage)
 """In the order in which a run does them"""

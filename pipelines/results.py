@@ -26,6 +26,7 @@ from pipelines.options import SequenceOptions
 from pipelines.request import RunRequest
 from pipelines.stages import Made
 from sync.align import SyncReport
+from sync.content import Content
 from tasks.artefacts.jobs import CancelledError
 from tasks.artefacts.recipe import plain
 from tasks.artefacts.store import Store
@@ -46,6 +47,7 @@ from tasks.report.facts import (
 )
 from tasks.report.write import JSON_NAME, PAGE_NAME
 from tasks.stages.calibrate import CHECK
+from tasks.stages.content import read_content
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
 from tasks.stages.fitting import REFUSED
@@ -162,6 +164,7 @@ def collect(run: Run) -> ReportInput:
         rig=Rig.load(rig_folder / RIG) if rig_folder else None,
         held_out=run.plan.held_out,
         check=_check(run),
+        content=_content(run.folder("content")),
         footage=tuple(_footage_notes(run)),
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
         unlike=_points_notes(run).get("unlike", {}),
@@ -178,9 +181,9 @@ def collect(run: Run) -> ReportInput:
 
 
 GROUPS = {
-    "sync": "sync",
+    **dict.fromkeys(("clock", "sync"), "sync"),
     **dict.fromkeys(("rig", "light", "points"), "calibrate"),
-    **dict.fromkeys(("motion", "patches", "keyframes"), "flow"),
+    **dict.fromkeys(("motion", "content", "patches", "keyframes"), "flow"),
     **dict.fromkeys(("background", "backdrop", "key", "segment", "preview"), "fit"),
     **{name: name for name in ("encode", "verify", "evaluate")},
 }
@@ -235,6 +238,10 @@ def _footage_notes(run: Run) -> Iterator[str]:
         yield from (damage_told(name, facts) for name, facts in read_damage(light).items())
     elif run.folder("points"):
         yield "damaged pictures were not looked for, since light.enabled is false"
+
+
+def _content(folder: Path | None) -> Content | None:
+    return read_content(folder) if folder else None
 
 
 def _points_notes(run: Run) -> Mapping[str, Any]:

@@ -20,10 +20,13 @@ from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
 from sync.capture import find_capture, find_plate
+from sync.clock import ClockMode
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig
+from tasks.stages.clock import find_starts
+from tasks.stages.content import CompareContent
 from tasks.stages.encode import Encode, Verify
 from tasks.stages.evaluate import Evaluate, scored_cameras
 from tasks.stages.fitting import (
@@ -138,7 +141,10 @@ class Sequence:
 
     def _synchronize(self) -> None:
         find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
-        groups = self._make(synchronize(self.workshop, self.options.sync))
+        options, starts = self.options, None
+        if options.sync.clock is ClockMode.CONTENT:
+            starts = self._make(find_starts(self.workshop, options.motion))
+        groups = self._make(synchronize(self.workshop, options.sync, starts))
         check_space(self.workshop, self.plan, self.options, groups)
         self.synchronized(groups)
 
@@ -172,10 +178,22 @@ class Sequence:
     def _track(self) -> None:
         take, options = self._take("rig"), self.options
         motion = self._make(FindMotion(take=take, options=options.motion))
+        self._compare(take, motion)
         if patches := self._patches(take):
             self._make(ChooseDatedKeyframes(motion=motion, patches=patches, options=options.keyframes))
         else:
             self._make(ChooseKeyframes(motion=motion, options=options.keyframes))
+
+    def _compare(self, take: Take, motion: Key) -> None:
+        if not self.options.content.enabled:
+            self.workshop.listener.skipped("content", "content.enabled is false")
+            return
+        unseen, options = self.plan.held_out, self.options
+        self._make(
+            CompareContent(
+                take=take, unseen=unseen, motion=motion, motion_options=options.motion, options=options.content
+            )
+        )
 
     def _patches(self, take: Take) -> Key | None:
         """What changes for good; None where nothing does, so that nothing depends on how that was found."""

@@ -33,6 +33,8 @@ RATE_OFF = 0.1
 """Share by which timecodes may run faster or slower than the container"""
 LABELS_APART = 1.5
 """Frames that a label may be off a timecode file: it counts whole ones"""
+MOST_OFFSET_S = 10**6
+"""By which a camera's times may be moved: eleven days"""
 SHARED_TIMECODES = "timestamps.csv"
 SETTINGS = "capture.toml"
 SOLVE = "solve"
@@ -70,6 +72,8 @@ class CaptureSettings:
     """Where the calibration is, relative to the capture, or 'solve'; None looks into calibration/"""
     timecode_column: str | None = None
     """Time column of the CSV or JSON timecodes, where there are several"""
+    time_offset_s: Mapping[str, Decimal] = field(default_factory=dict)
+    """Seconds to add to the times of cameras whose timecodes are off"""
     transfer: str | None = None
     """One of TRANSFERS: what the code values of all videos mean; None leaves it to their tags"""
     rig_from: str | None = None
@@ -252,6 +256,15 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
         ValueError: some cameras have timecode files and others have not (their times would not be comparable), a file
             does not parse, or its lines do not fit the frames of the video.
     """
+    moves = capture.settings.time_offset_s
+    return {
+        camera: codes.moved(int(moves[camera] * NANOSECONDS)) if moves.get(camera) else codes
+        for camera, codes in _told_timecodes(capture, infos).items()
+    }
+
+
+def _told_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
+    """As files and containers tell them."""
     if not capture.timecodes:
         return together({camera: container_timecodes(infos[camera]) for camera in capture.cameras})
     frames = {camera: infos[camera].frame_count for camera in capture.cameras}
@@ -544,7 +557,7 @@ def _calibrations(inside: Path) -> list[Path]:
 
 
 def _check_names(path: Path, settings: CaptureSettings, videos: Mapping[str, Path]) -> None:
-    for key in ("reference", "held_out", "ignore"):
+    for key in ("reference", "held_out", "ignore", "time_offset_s"):
         value = getattr(settings, key)
         for camera in (value,) if isinstance(value, str) else value or ():
             if camera not in videos:
@@ -566,11 +579,26 @@ def _checked(path: Path, key: str, value: Any) -> Any:
     if key == "transfer" and value not in TRANSFERS:
         close = _suggest(str(value), TRANSFERS)
         raise ValueError(f"{path}: transfer must be one of {', '.join(TRANSFERS)}, but is {value!r}{close}")
+    if key == "time_offset_s":
+        return _checked_offsets(path, value)
     many = key in ("tags", "held_out", "ignore")
     texts = value if many else [value]
     if not isinstance(texts, list) or not all(isinstance(text, str) and text for text in texts):
         raise ValueError(f"{path}: {key} must be {'a list of texts' if many else 'a text'}, but is {value!r}")
     return tuple(texts) if many else value
+
+
+def _checked_offsets(path: Path, value: Any) -> dict[str, Decimal]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: time_offset_s must be a table of seconds by camera, but is {value!r}")
+    for camera, seconds in value.items():
+        number = isinstance(seconds, (int, Decimal)) and not isinstance(seconds, bool)
+        if not number or not abs(seconds) <= MOST_OFFSET_S:
+            raise ValueError(
+                f"{path}: time_offset_s of {camera!r} must be a number of seconds, at most {MOST_OFFSET_S} either "
+                f"way, but is {seconds!r}"
+            )
+    return {camera: Decimal(seconds) for camera, seconds in value.items()}
 
 
 def _suggest(name: str, known: Iterable[str]) -> str:

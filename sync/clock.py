@@ -31,6 +31,8 @@ class ClockMode(StrEnum):
     """Clocks agree (PTP, genlock with common time): differences are real and passed on as sub-frame times"""
     TRIGGERED = "triggered"
     """One trigger fires all cameras: differences are offset and drift of the clocks, and are fitted and removed"""
+    CONTENT = "content"
+    """Times tell only how long each camera has filmed; when it began, its pictures tell"""
 
 
 class ClockState(StrEnum):

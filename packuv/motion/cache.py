@@ -300,6 +300,10 @@ class MotionCache:
             return None
         return self._enlarged(camera, self._bits(camera, instant), size)
 
+    def measured(self, camera: int, instant: int) -> np.ndarray | None:
+        """What moved since the previous picture, as it was measured, not dilated: bool [hm, wm], or None."""
+        return None if self.previous[instant, camera] < 0 else self._bits(camera, instant)
+
     def union(self, camera: int, first: int, last: int, *, size: tuple[int, int] | None = None) -> np.ndarray | None:
         """All that moved in the steps to the instants of [first, last), as `mask`; None if there is no step at all."""
         steps = [instant for instant in range(first, last) if self.previous[instant, camera] >= 0]

@@ -61,7 +61,8 @@ def asked_for(arguments: argparse.Namespace) -> dict[str, Any]:
     chosen = arguments.max_minutes is not None or arguments.target_psnr is not None
     # Who names a time or an error, and no preset, sets no bound.
     preset = arguments.preset or (PRESETS[-1] if chosen else RunRequest.preset)
-    return {**named, "preset": preset, "settings": read_settings(arguments.config, arguments.set)}
+    pairs = [*([f"sync.clock={arguments.clock}"] if arguments.clock else []), *arguments.set]
+    return {**named, "preset": preset, "settings": read_settings(arguments.config, pairs)}
 
 
 def run(request: RunRequest, journal: Journal, *, direct: bool) -> Outcome:

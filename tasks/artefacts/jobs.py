@@ -261,7 +261,7 @@ def raised(error: Mapping[str, Any], log: Path) -> Exception:
     for kind in RAISED_AS:
         if kind.__name__ in error["kinds"]:
             found = kind(error["message"])
-            if isinstance(found, OSError):
+            if isinstance(found, OSError) and error["errno"] is not None:  # without a number its text is the message
                 found.errno, found.strerror, found.filename = error["errno"], error["strerror"], error["filename"]
             found.add_note(f"the job's own traceback is in {log}")
             return found

@@ -22,6 +22,7 @@ from packuv.metrics import trend
 from packuv.scene import Scene
 from packuv.scene.stream import REPEAT
 from sync.align import SyncReport
+from sync.content import Content
 from sync.natural import natural_key
 
 MAX_PSNR_DB = 99.0
@@ -273,6 +274,7 @@ class ReportInput:
     held_out: tuple[str, ...] = ()
     """Cameras that were never fitted"""
     check: RigReport | None = None
+    content: Content | None = None
     footage: tuple[str, ...] = ()
     """What was read of the videos and what was not, where it is not plain, and which pictures are damaged"""
     colours: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

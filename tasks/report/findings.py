@@ -63,6 +63,7 @@ def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...
         *_run_findings(report),
         *(Finding("sync", f"{note}.") for note in report.footage),
         *_sync_findings(report, limits),
+        *_content_findings(report),
         *_rig_findings(report, limits),
         *_light_findings(report, limits),
         *_motion_findings(report),
@@ -91,6 +92,27 @@ def _sync_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
             late = row.residual_p95_ns / report.sync.period_ns
             yield Finding("sync", f"{row.camera}: one frame in twenty is {late:.2f} frame periods or more off.")
     yield from (Finding("sync", f"{note}.") for note in report.sync.notes)
+
+
+def _content_findings(report: ReportInput) -> Iterator[Finding]:
+    """Cameras whose pictures refute their times, then those that nobody can tell of."""
+    content, period = report.content, report.sync.period_ns if report.sync else 0
+    if content is None:
+        return
+    for camera in content.cameras:
+        window, offset = content.worst(camera) or (None, None)
+        if window and offset and offset.lies:
+            move = f"{camera} = {offset.away * period / 1e9:.4f}"
+            yield Finding(
+                "sync",
+                f"The pictures of {camera} lie {offset.away:+.1f} frames (+- {offset.error:.1f}) from those of the "
+                f"others at the same times, by what moves in frames {window.first} to {window.last}; if its timecodes "
+                f"are wrong, set time_offset_s = {{ {move} }} in capture.toml.",
+            )
+    if content.undecided:
+        names = content.undecided
+        whose = "times of any camera" if len(names) == len(content.cameras) else f"times of {', '.join(names)}"
+        yield Finding("sync", f"The pictures do not prove the {whose}: too little moves that several cameras see.")
 
 
 def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:

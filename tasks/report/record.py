@@ -49,6 +49,7 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
         "summary": summary(report),
         "findings": [plain(finding) for finding in findings(report, limits)],
         "sync": report.sync and report.sync.to_json(),
+        "content": report.content and plain(report.content),
         "cameras": _cameras_json(report),
         "check": report.check and report.check.to_json(),
         "light": report.light

@@ -117,8 +117,14 @@ def _sync(report: ReportInput, limits: Limits) -> Body:
         "clock": str(sync.clock),
         "complete": sync.complete,
         "instants": sync.instants,
-        "cameras": [_sync_row(row, sync, limits) for row in sync.cameras],
+        "cameras": [{**_sync_row(row, sync, limits), "content": _content(row.camera, report)} for row in sync.cameras],
     }
+
+
+def _content(camera: str, report: ReportInput) -> View | None:
+    """By how many frames a camera's pictures refute its times; None where they do not tell."""
+    told = report.content.worst(camera) if report.content else None
+    return told and {"frames": told[1].away, "error": told[1].error, "lies": told[1].lies}
 
 
 def _sync_row(row: CameraReport, sync: SyncReport, limits: Limits) -> View:

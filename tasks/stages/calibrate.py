@@ -77,7 +77,7 @@ class ImportRig(Stage):
     def build(self, work: Work) -> Notes:
         capture, footage = find_capture(work.site.capture), Footage(self.take, work.site)
         source = capture.calibration
-        if source is None or _files(source).keys() != self.files.sha256.keys():
+        if source is None or calibration_files(source).keys() != self.files.sha256.keys():
             raise FileNotFoundError(f"the calibration of {capture.folder} is another one than when the run began")
         pictures = footage.filmed(self.first)
         sizes = _sizes(footage, pictures, read_videos(work.path(self.take.groups)))
@@ -197,7 +197,7 @@ def find_rig(
         # Trust is of given rigs: who trusts a lent one must not have it solved again.
         return SolveRig(take=take, first=plan.first, options=replace(options, trust=False))
     find_calibration(source)  # a folder without a calibration is a mistake, which no solution may hide
-    files = workshop.files(_files(source), "reading calibration")
+    files = workshop.files(calibration_files(source), "reading calibration")
     return ImportRig(take=take, first=plan.first, files=files, options=options)
 
 
@@ -390,7 +390,7 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _files(source: Path) -> dict[str, Path]:
+def calibration_files(source: Path) -> dict[str, Path]:
     """Every file of a calibration, by its relative name."""
     if source.is_file():
         return {source.name: source}

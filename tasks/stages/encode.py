@@ -19,10 +19,12 @@ from packuv.gaussians.segment import Segment
 from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
 from packuv.scene.sharing import stored_segments
 from sync.align import SyncReport
+from sync.clock import ClockMode
 from tasks.artefacts.stage import Notes, Site, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.stages.fitting import SEGMENT
 from tasks.stages.footage import Footage, Take, lens_camera
+from tasks.stages.synchronize import STARTS_NS, starts_of
 
 SCENE = "scene.mkv"
 
@@ -118,6 +120,8 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState, lig
             "clock": str(report.clock),
             "instants": report.instants,
             "complete": report.complete,
+            # Elsewhere times of the capture itself tell it.
+            **({STARTS_NS: starts_of(report)} if report.clock is ClockMode.CONTENT else {}),
         },
         extra={
             "near": key.bounds.near,

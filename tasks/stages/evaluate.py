@@ -28,6 +28,7 @@ from tasks.report.facts import FrameScore, frames_to_picture
 from tasks.stages.encode import SCENE
 from tasks.stages.footage import Footage, Take
 from tasks.stages.plan import Plan
+from tasks.stages.synchronize import STARTS_NS, begun
 
 METRICS, TABLE, PICTURES = "metrics.json", "metrics.arrow", "pictures"
 
@@ -146,7 +147,12 @@ def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
     if tolerance_ns is not None:
         tolerance_ns = whole(tolerance_ns, f"{what}: tolerance_ns", most=MOST_NS)
     options = AlignOptions(reference=reference, tolerance_ns=tolerance_ns, clock=ClockMode(clock))
-    return align(load_timecodes(found, infos), options)[0]
+    timecodes = load_timecodes(found, infos)
+    if options.clock is ClockMode.CONTENT:
+        starts = fields(field(sync, STARTS_NS, what), f"{what}: {STARTS_NS}")
+        known = {name: whole(starts.get(name), f"{what}: {STARTS_NS}: {name}", most=MOST_NS) for name in timecodes}
+        timecodes = begun(timecodes, known)
+    return align(timecodes, options)[0]
 
 
 def _rows(groups: FrameGroups, times_ns: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,16 @@ from typing import Any
 from sync.align import AlignOptions, FrameGroups, SyncReport, align, build_index, save_index
 from sync.capture import Capture, find_capture, load_timecodes, picture_notes, probe_capture
 from sync.probe import VideoInfo
+from sync.timecode import Timecodes
 from tasks.artefacts.recipe import write_json
 from tasks.artefacts.stage import Files, Notes, Stage, Work
+from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 
+STARTS = "starts.json"
+STARTS_NS = "starts_ns"
+"""Key of the same in the header of a scene"""
+BY_CONTENT = "what moves in the pictures"
 FOOTAGE = "footage"
 """Name of the notes on what was read of the videos, and what was not; missing where there are none"""
 
@@ -32,6 +38,10 @@ class Synchronize(Stage):
     """What capture.toml says"""
     timecode_column: str | None
     """Likewise"""
+    time_offset_s: Mapping[str, str] = field(default_factory=dict)
+    """Likewise, as text"""
+    starts: Key | None = None
+    """When the cameras began to film; None where times tell it"""
     options: AlignOptions
 
     def build(self, work: Work) -> Notes:
@@ -39,6 +49,8 @@ class Synchronize(Stage):
         self._check(found)
         infos = probe_capture(found, work.progress)
         timecodes = load_timecodes(found, infos)
+        if self.starts is not None:
+            timecodes = begun(timecodes, read_starts(work.path(self.starts)))
         groups, report = align(timecodes, self.options)
         groups.save(work.out, report)
         save_index(build_index(timecodes, report.clocks), work.out)
@@ -55,11 +67,12 @@ class Synchronize(Stage):
         if (videos, timecodes) != (list(self.videos.sha256), list(self.timecodes.sha256)) or (
             settings.fps,
             settings.timecode_column,
-        ) != (self.fps, self.timecode_column):
+            _offsets(found),
+        ) != (self.fps, self.timecode_column, self.time_offset_s):
             raise ValueError(f"files or settings of {found.folder} changed while they were read; run the command again")
 
 
-def synchronize(workshop: Workshop, options: AlignOptions) -> Synchronize:
+def synchronize(workshop: Workshop, options: AlignOptions, starts: Key | None) -> Synchronize:
     """The stage for a workshop's capture; cost: reading the files that changed since the last time."""
     capture = workshop.capture
     return Synchronize(
@@ -67,8 +80,30 @@ def synchronize(workshop: Workshop, options: AlignOptions) -> Synchronize:
         timecodes=workshop.files(capture.timecodes, "reading timecodes"),
         fps=capture.settings.fps,
         timecode_column=capture.settings.timecode_column,
+        time_offset_s=_offsets(capture),
+        starts=starts,
         options=options,
     )
+
+
+def _offsets(capture: Capture) -> dict[str, str]:
+    return {camera: str(seconds) for camera, seconds in capture.settings.time_offset_s.items()}
+
+
+def read_starts(folder: Path) -> dict[str, int]:
+    """When each camera began to film, ns."""
+    data = json.loads((folder / STARTS).read_text())
+    return {name: round(start * 1e9) for name, start in data["starts_s"].items()}
+
+
+def starts_of(report: SyncReport) -> dict[str, int]:
+    """The same, as a report of them tells it."""
+    return {camera.camera: camera.start_ns for camera in report.cameras}
+
+
+def begun(timecodes: Mapping[str, Timecodes], starts_ns: Mapping[str, int]) -> dict[str, Timecodes]:
+    """Times counted from where each camera began, by its pictures."""
+    return {name: codes.begun(starts_ns[name], BY_CONTENT) for name, codes in timecodes.items()}
 
 
 def selected(groups: FrameGroups, first: int, stop: int | None) -> range:

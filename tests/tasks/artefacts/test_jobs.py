@@ -47,6 +47,7 @@ def area(progress, size: Size, names: tuple[str, ...], out: Path):
 
 def bad_input(progress): raise CaptureError("cam03 has no frames")
 def missing(progress): raise FileNotFoundError(2, "no such thing", "cam03.mp4")
+def wordy(progress): raise OSError("the store is another machine's")
 def full(progress): raise OSError(28, "No space left on device")
 def full_here(progress): raise OSError(28, "No space left on device", Path("/runs/a.npz"))
 def full_hidden(progress): raise RuntimeError("could not write")
@@ -137,6 +138,7 @@ def test_arguments_results_and_progress_cross_over(jobs, work, tmp_path):
         ("bad_input", ValueError, r"^cam03 has no frames(\n|$)"),
         ("missing", FileNotFoundError, r"no such thing: 'cam03\.mp4'"),
         ("full", OSError, "No space left on device"),
+        ("wordy", OSError, "^the store is another machine's"),
         ("bug", JobError, r"^KeyError: key; the traceback is in .*job\.log$"),
         ("dies", JobDiedError, r"ended without a result \(killed by signal 9, as happens when memory runs out\)"),
         ("says", JobDiedError, r"ended without a result \(exit code 3\)"),

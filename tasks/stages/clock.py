@@ -1,0 +1,130 @@
+"""Clock: when the cameras filmed, by what moves in their pictures, for captures whose times tell nothing of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.importers import load_rig
+from calibration.rig import Rig
+from packuv.camera import PinholeCamera
+from packuv.files import save_json
+from packuv.footage import LensCamera, Views
+from packuv.motion import MotionOptions, measure_motion
+from sync.capture import Capture, find_capture, load_timecodes, probe_capture
+from sync.content import APART, Activity, Offset, find_offsets
+from tasks.artefacts.stage import Files, Notes, Stage, Work
+from tasks.artefacts.workshop import Workshop
+from tasks.stages.calibrate import calibration_files
+from tasks.stages.content import activity_of
+from tasks.stages.footage import lens_camera
+from tasks.stages.synchronize import STARTS
+
+WINDOW_SECONDS = 20.0
+"""Of each video are looked at, from its middle; offsets of up to half of it are found"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FindStarts(Stage):
+    """Find when each camera began to film, by what moves: starts.json, in seconds by camera."""
+
+    name, version = "clock", 1
+    videos: Files
+    timecodes: Files
+    calibration: Files | None
+    """Which need not be right: without one, or with one that the pictures refute, whole pictures are compared"""
+    options: MotionOptions
+
+    def build(self, work: Work) -> Notes:
+        capture = find_capture(work.site.capture)
+        infos = probe_capture(capture, work.progress)
+        times = {name: codes.times_ns - codes.times_ns.min() for name, codes in load_timecodes(capture, infos).items()}
+        sizes = {name: (info.width, info.height) for name, info in infos.items()}
+        frames, period_s = _rows(times)
+        offsets, by = {}, ""
+        for by, lenses in _lenses(capture, sizes, known=self.calibration is not None):
+            seen = self._activity(capture, frames, lenses, work, posed=by == "calibration")
+            offsets = find_offsets(seen, len(frames) // 2, paired=False)
+            if not _unsure(times, offsets):
+                break
+        if unsure := _unsure(times, offsets):
+            raise ValueError(
+                f"the pictures do not tell when {', '.join(unsure)} began to film: in their middle {WINDOW_SECONDS:g} "
+                "s too little moves that several cameras see, or they began further than half of that apart; give a "
+                "calibration, with which pictures tell more, or timecodes, cut the videos to about a common start, or "
+                "leave these cameras out with 'ignore' in capture.toml"
+            )
+        first = min(offset.instants for offset in offsets.values())
+        starts = {name: round((offset.instants - first) * period_s, 6) for name, offset in offsets.items()}
+        errors = {name: round(offset.error * period_s, 6) for name, offset in offsets.items()}
+        save_json(work.out / STARTS, {"by": by, "starts_s": starts, "errors_s": errors})
+        return {"by": by, "cameras": len(starts), "latest_s": max(starts.values())}
+
+    def _activity(
+        self, capture: Capture, frames: np.ndarray, lenses: list[LensCamera], work: Work, *, posed: bool
+    ) -> Mapping[str, Activity]:
+        views = Views(dict(capture.videos), frames, lenses)
+        folder = work.scratch / ("posed" if posed else "filmed")
+        options, threads = self.options, work.site.threads
+        cache = measure_motion(views, folder, options, workers=threads, progress=work.progress)
+        whole = range(len(frames))
+        return {
+            camera.name: activity_of(cache, column, camera, whole, posed=posed)
+            for column, camera in enumerate(views.cameras)
+        }
+
+
+def find_starts(workshop: Workshop, options: MotionOptions) -> FindStarts:
+    """The stage for a capture whose cameras began at times that nobody noted."""
+    capture = workshop.capture
+    source = capture.calibration
+    files = None if source is None else workshop.files(calibration_files(source), "reading calibration")
+    return FindStarts(
+        videos=workshop.files(capture.videos, "reading videos"),
+        timecodes=workshop.files(capture.timecodes, "reading timecodes"),
+        calibration=files,
+        options=replace(options, keep_flow=False),
+    )
+
+
+def _rows(times: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float]:
+    """Frames int [T, C] that would be of one moment had all cameras begun at once, and the seconds between rows."""
+    period = float(np.median([np.median(np.diff(np.sort(own))) for own in times.values() if len(own) > 1]))
+    shortest = min(float(own.max()) for own in times.values())
+    span = min(shortest, WINDOW_SECONDS * 1e9)
+    grid = (shortest - span) / 2 + np.arange(int(span / period) + 1) * period
+    columns = []
+    for own in times.values():
+        order = np.argsort(own, kind="stable")
+        after = np.clip(np.searchsorted(own[order], grid), 1, max(1, len(own) - 1))
+        nearer = np.where(
+            grid - own[order][after - 1] <= own[order][after % len(own)] - grid, after - 1, after % len(own)
+        )
+        found = order[nearer]
+        columns.append(np.where(np.abs(own[found] - grid) <= period / 2, found, -1))
+    return np.stack(columns, axis=1), period / 1e9
+
+
+def _lenses(
+    capture: Capture, sizes: Mapping[str, tuple[int, int]], *, known: bool
+) -> Iterator[tuple[str, list[LensCamera]]]:
+    """The cameras as calibrated, if they are, then as if nothing were known of them."""
+    if known and capture.calibration is not None:
+        with suppress(ValueError, OSError):  # the stage that imports it says what is wrong
+            rig: Rig = load_rig(capture.calibration, tuple(sizes), sizes)
+            yield "calibration", [lens_camera(camera) for camera in rig.resized(sizes).cameras]
+    yield (
+        "whole pictures",
+        [
+            LensCamera(PinholeCamera(name, width, height, width, width, width / 2, height / 2, np.eye(4)))
+            for name, (width, height) in sizes.items()
+        ],
+    )
+
+
+def _unsure(names: Iterable[str], offsets: Mapping[str, Offset]) -> list[str]:
+    """Cameras of which the pictures do not tell the nearest frame."""
+    return [name for name in names if name not in offsets or offsets[name].error > APART]

@@ -1,0 +1,109 @@
+"""Offsets by content: balls on smooth ways, seen by cameras all round at times that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sync.content import Activity, Content, Offset, Window, find_offsets
+from tests.support.balls import camera_pose, covered, pixels_of
+
+INSTANTS, REACH = 120, 8
+
+
+def seen_by(number: int, count: int, times: np.ndarray, *, lost: tuple[int, ...] = ()) -> Activity:
+    """What moves in the pictures of a camera that films at these times, in instants."""
+    seen = covered(number, count, times)
+    moving = np.zeros(seen.shape, np.float32)
+    moving[1:] = seen[1:] != seen[:-1]
+    there = np.arange(len(times)) > 0
+    there[list(lost)] = False
+    moving[list(lost)] = 0
+    turn, centre = camera_pose(number, count)
+    return Activity(moving, there, centre, (turn.T @ pixels_of()).T)
+
+
+def rig(count: int, late: dict[int, float] | None = None) -> dict[str, Activity]:
+    """Cameras of which some show what the others show so many instants later."""
+    times = np.arange(INSTANTS, dtype=float)
+    return {f"cam{number}": seen_by(number, count, times + (late or {}).get(number, 0.0)) for number in range(count)}
+
+
+@pytest.mark.parametrize("count", [3, 6, 12])
+def test_cameras_in_step_are_told_to_be(count):
+    offsets = find_offsets(rig(count), REACH)
+    assert len(offsets) == count
+    for offset in offsets.values():
+        assert offset.decided
+        assert not offset.lies
+        assert abs(offset.instants) < 0.2
+
+
+@pytest.mark.parametrize("late", [-5, -2, -1, 1, 2, 5])
+def test_a_camera_that_is_frames_off_is_named_and_no_other(late):
+    for number in (0, 3):
+        offsets = find_offsets(rig(6, {number: late}), REACH)
+        assert [name for name, offset in offsets.items() if offset.lies] == [f"cam{number}"]
+        assert offsets[f"cam{number}"].instants == pytest.approx(late, abs=0.25)
+
+
+def test_several_cameras_may_be_off_by_frames_of_their_own():
+    offsets = find_offsets(rig(7, {1: 2, 4: -3}), REACH)
+    assert {name: round(offset.away) for name, offset in offsets.items() if offset.lies} == {"cam1": 2, "cam4": -3}
+
+
+@pytest.mark.parametrize("late", [-0.4, 0.3, 0.5])
+def test_parts_of_a_frame_are_measured_and_no_lie_where_the_times_say_so(late):
+    offset = find_offsets(rig(6, {2: late}), REACH)["cam2"]
+    assert offset.instants == pytest.approx(late, abs=0.15)
+    expected = find_offsets(rig(6, {2: 1 + late}), REACH, {"cam2": 1 + late})["cam2"]
+    assert abs(expected.away) < 0.2
+    assert not expected.lies
+
+
+def test_the_order_of_cameras_hardly_matters():
+    seen = rig(5, {1: 1})
+    again = find_offsets(dict(reversed(seen.items())), REACH)
+    for name, offset in find_offsets(seen, REACH).items():
+        assert again[name].instants == pytest.approx(offset.instants, abs=0.1)
+        assert again[name].lies == offset.lies
+
+
+def test_lost_frames_are_no_motion_and_no_rest():
+    seen = rig(6, {2: 1})
+    seen["cam4"] = seen_by(4, 6, np.arange(INSTANTS, dtype=float), lost=(20, 21, 60, 61, 62, 63, 100))
+    offsets = find_offsets(seen, REACH)
+    assert [name for name, offset in offsets.items() if offset.lies] == ["cam2"]
+
+
+def test_who_sees_nothing_move_is_not_judged():
+    seen = rig(4)
+    seen["cam3"] = Activity(np.zeros_like(seen["cam3"].moving), seen["cam3"].there, *_place(seen["cam3"]))
+    assert set(find_offsets(seen, REACH)) == {"cam0", "cam1", "cam2"}
+    still = {name: Activity(np.zeros_like(own.moving), own.there, *_place(own)) for name, own in seen.items()}
+    assert find_offsets(still, REACH) == {}
+    assert find_offsets({}, REACH) == {}
+
+
+def test_motion_that_no_other_camera_sees_decides_nothing():
+    rng = np.random.default_rng(0)
+    seen = rig(5)
+    noise = (rng.random(seen["cam0"].moving.shape) < 0.002).astype(np.float32)
+    seen["cam0"] = Activity(noise, seen["cam0"].there, *_place(seen["cam0"]))
+    offsets = find_offsets(seen, REACH)
+    assert not any(offset.lies for offset in offsets.values())
+    assert not offsets["cam0"].decided
+
+
+def _place(own: Activity) -> tuple[np.ndarray, np.ndarray]:
+    return own.centre, own.rays
+
+
+def test_the_stretch_that_says_most_against_a_camera_is_told():
+    right, wrong, unsure = Offset(0.1, 0.1), Offset(2.1, 0.1), Offset(4.0, 2.0)
+    windows = (Window(0, 99, {"a": right, "b": unsure}), Window(100, 199, {"a": wrong, "c": right}))
+    content = Content(("a", "b", "c", "d"), windows)
+    assert content.worst("a") == (windows[1], wrong)
+    assert content.worst("b") is None
+    assert content.worst("c") == (windows[1], right)
+    assert content.undecided == ("b", "d")

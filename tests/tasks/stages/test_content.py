@@ -1,0 +1,209 @@
+"""Times by pictures: videos of balls whose cameras begin at times that are known, or whose timecodes lie."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from calibration.rig import Camera, Rig
+from packuv.motion import MotionOptions
+from pipelines.options import compose
+from sync.align import AlignOptions, SyncReport
+from sync.capture import CaptureSettings, find_capture
+from sync.clock import ClockMode
+from sync.content import Content, ContentOptions, find_offsets
+from tasks.artefacts.stage import Files, Site
+from tasks.artefacts.store import Key
+from tasks.report.facts import ReportInput
+from tasks.report.findings import findings
+from tasks.stages.clock import FindStarts
+from tasks.stages.content import CompareContent, choose_windows, read_content
+from tasks.stages.footage import RIG, Take
+from tasks.stages.synchronize import Synchronize, read_starts
+from tasks.stages.track import MOTION, FindMotion
+from tests.support.artefacts import build_here, put
+from tests.support.balls import FOCAL, camera_pose, covered
+from tests.support.balls import WIDTH as GRID
+
+WIDTH, HEIGHT, FRAMES, COUNT = 160, 90, 80, 5
+NAMES = tuple(f"cam{number}" for number in range(COUNT))
+MOTION_OPTIONS = MotionOptions(keep_flow=False, width=WIDTH)
+
+
+def film(folder: Path, late: dict[int, float]) -> None:
+    """A video for each camera, which begins `late` instants after the first; bright balls before a grey ramp."""
+    (folder / "videos").mkdir(parents=True)
+    wall = np.linspace(40, 90, WIDTH * HEIGHT).astype(np.uint8)
+    for number, name in enumerate(NAMES):
+        times = np.arange(FRAMES) + late.get(number, 0.0)
+        with av.open(str(folder / "videos" / f"{name}.mkv"), "w") as container:
+            stream = container.add_stream("ffv1", rate=30)
+            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "bgr0"
+            for seen in covered(number, COUNT, times, WIDTH, HEIGHT):
+                grey = np.where(seen, 230, wall).astype(np.uint8).reshape(HEIGHT, WIDTH)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.dstack([grey] * 3), format="rgb24")))
+            container.mux(stream.encode())
+
+
+def calibrated() -> Rig:
+    cameras = []
+    for number, name in enumerate(NAMES):
+        turn, centre = camera_pose(number, COUNT)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ centre
+        focal = FOCAL * WIDTH / GRID
+        cameras.append(Camera(name, WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, pose))
+    return Rig(tuple(cameras), "made up")
+
+
+def write_calibration(folder: Path) -> None:
+    frames = [
+        {
+            "file_path": f"images/{camera.name}.png", "w": camera.width, "h": camera.height, "fl_x": camera.fx,
+            "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
+            "transform_matrix": (np.linalg.inv(camera.camera_from_world) @ np.diag([1, -1, -1, 1])).tolist(),
+        } for camera in calibrated().cameras
+    ]  # fmt: skip
+    (folder / "calibration").mkdir()
+    (folder / "calibration" / "transforms.json").write_text(json.dumps({"frames": frames}))
+
+
+def write_times(folder: Path, early: dict[int, int]) -> None:
+    """Timecode files of microseconds; some cameras' say so many frames too early."""
+    (folder / "timecodes").mkdir()
+    for number, name in enumerate(NAMES):
+        first = 1_700_000_000_000_000 - round(early.get(number, 0) * 1e6 / 30)
+        lines = [f"frame_{first + round(k * 1e6 / 30)}_{k:012d}\n" for k in range(FRAMES)]
+        (folder / "timecodes" / f"{name}.txt").write_text("".join(lines))
+
+
+def synchronized(site: Site, folder: Path, starts: Key | None = None) -> Key:
+    capture = find_capture(site.capture)
+    stage = Synchronize(
+        videos=Files(dict.fromkeys(NAMES, "content")),
+        timecodes=Files(dict.fromkeys(capture.timecodes, "content")),
+        fps=None,
+        timecode_column=None,
+        time_offset_s={name: str(seconds) for name, seconds in capture.settings.time_offset_s.items()},
+        starts=starts,
+        options=AlignOptions(clock=ClockMode.CONTENT if starts else ClockMode.TRUSTED),
+    )
+    return _made(stage, site, folder)
+
+
+def _made(stage: Synchronize | FindMotion | FindStarts | CompareContent, site: Site, folder: Path) -> Key:
+    _, out = build_here(stage, site, folder)
+    return put(
+        site, stage.name, lambda there: [path.rename(there / path.name) for path in out.iterdir()], at=str(folder)
+    )
+
+
+def compared(site: Site, folder: Path, groups: Key) -> Key:
+    """The check, with one camera whose motion nobody has measured."""
+    rig = put(site, "rig", lambda out: calibrated().save(out / RIG))
+    take = Take(groups=groups, rig=rig, cameras=NAMES[:-1])
+    motion = _made(FindMotion(take=take, options=MOTION_OPTIONS), site, folder / "motion")
+    assert (site.path(motion) / MOTION).is_dir()
+    return _made(
+        CompareContent(
+            take=take, unseen=NAMES[-1:], motion=motion, motion_options=MOTION_OPTIONS, options=ContentOptions()
+        ),
+        site,
+        folder / "content",
+    )
+
+
+def lies_in(content: Content) -> dict[str, float]:
+    told = {name: content.worst(name) for name in content.cameras}
+    return {name: own[1].away for name, own in told.items() if own is not None and own[1].lies}
+
+
+@pytest.mark.parametrize("liar", [1, 4])
+def test_a_camera_whose_timecodes_lie_is_named_and_its_cure_cures(tmp_path: Path, liar: int) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    film(site.capture, {})
+    write_times(site.capture, {liar: 2})
+    found = read_content(site.path(compared(site, tmp_path / "first", synchronized(site, tmp_path / "sync"))))
+    assert {name: round(away) for name, away in lies_in(found).items()} == {f"cam{liar}": 2}
+    assert not found.undecided
+
+    (site.capture / "capture.toml").write_text(f"time_offset_s = {{ cam{liar} = {2 / 30:.4f} }}")
+    groups = synchronized(site, tmp_path / "mended")
+    again = read_content(site.path(compared(site, tmp_path / "again", groups)))
+    assert not lies_in(again)
+    assert "are added to its times, as time_offset_s" in (site.path(groups) / "sync.json").read_text()
+
+
+def test_what_the_pictures_say_of_times_is_told(tmp_path: Path) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    film(site.capture, {})
+    write_times(site.capture, {0: -1})
+    groups = synchronized(site, tmp_path / "sync")
+    content = read_content(site.path(compared(site, tmp_path / "first", groups)))
+    report = ReportInput("balls", sync=SyncReport.load(site.path(groups)), content=content)
+    (told,) = [found.text for found in findings(report) if "pictures" in found.text]
+    assert told.startswith("The pictures of cam0 lie -1.0 frames")
+    assert "time_offset_s = { cam0 = -0.03" in told
+
+
+def test_cameras_without_times_are_synchronized_by_their_pictures(tmp_path: Path) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    late = {0: 6.0, 1: 0.0, 2: 3.4, 3: 11.0, 4: 1.0}
+    film(site.capture, late)
+    write_calibration(site.capture)
+    found = find_starts(site, tmp_path / "clock", known=True)
+    first = min(late.values())
+    for name, start_ns in read_starts(site.path(found)).items():
+        assert start_ns * 30 / 1e9 == pytest.approx(late[int(name[-1])] - first, abs=0.3)
+    assert json.loads((site.path(found) / "starts.json").read_text())["by"] == "calibration"
+
+    groups = synchronized(site, tmp_path / "sync", found)
+    report = json.loads((site.path(groups) / "sync.json").read_text())["report"]
+    assert report["clock"] == "content"
+    assert {camera["source"] for camera in report["cameras"]} == {"what moves in the pictures"}
+    content = read_content(site.path(compared(site, tmp_path / "check", groups)))
+    assert not lies_in(content)
+
+
+def find_starts(site: Site, folder: Path, *, known: bool) -> Key:
+    stage = FindStarts(
+        videos=Files(dict.fromkeys(NAMES, "content")),
+        timecodes=Files({}),
+        calibration=Files({"transforms.json": "content"}) if known else None,
+        options=MOTION_OPTIONS,
+    )
+    return _made(stage, site, folder)
+
+
+def test_pictures_that_tell_nothing_are_no_clock(tmp_path: Path) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    (site.capture / "videos").mkdir(parents=True)
+    for name in NAMES[:3]:
+        with av.open(str(site.capture / "videos" / f"{name}.mkv"), "w") as container:
+            stream = container.add_stream("ffv1", rate=30)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "bgr0"
+            for _ in range(30):
+                container.mux(
+                    stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64, 3), 90, np.uint8), format="rgb24"))
+                )
+            container.mux(stream.encode())
+    with pytest.raises(ValueError, match=r"do not tell when cam0, cam1, cam2 began to film.*; give a calibration"):
+        find_starts(site, tmp_path / "clock", known=False)
+
+
+def test_the_clock_is_chosen_in_capture_toml() -> None:
+    options = compose("draft", CaptureSettings(clock=ClockMode.CONTENT), {})
+    assert options.sync.clock is ClockMode.CONTENT
+
+
+def test_stretches_are_those_in_which_most_moves() -> None:
+    moving = np.zeros(3000)
+    moving[500:700] = moving[1500:1700] = moving[2500:2700] = 0.125
+    assert choose_windows(moving, ContentOptions()) == [range(500, 700), range(1500, 1700), range(2500, 2700)]
+    assert choose_windows(np.zeros(90), ContentOptions()) == [range(90)]
+    assert choose_windows(np.zeros(410), ContentOptions()) == [range(205), range(205, 410)]
+    assert find_offsets({}, 5) == {}
