@@ -343,7 +343,7 @@ def _how(command: argparse.ArgumentParser, *, stop: bool) -> None:
         "--clock",
         choices=CLOCKS,
         default=None,
-        help="what times are worth, whatever capture.toml says; content: nothing, so pictures tell when each camera began",
+        help="what times are worth, whatever capture.toml says; content: pictures tell when each camera began",
     )
     command.add_argument(
         "--frames", type=_range_text, default=":", metavar="A:B", help="instants A to B - 1, counted from 0 (all)"

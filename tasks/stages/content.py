@@ -102,8 +102,10 @@ def activity_of(
         measured = cache.measured(column, window[row])
         assert measured is not None, "there is a step to this instant"
         moving[row] = cv2.resize(measured.astype(np.float32), (GRID_WIDTH, height), interpolation=cv2.INTER_AREA)
-    places = (camera.centre, _rays(camera, GRID_WIDTH, height)) if posed else (None, None)
-    return Activity(moving.reshape(len(window), -1), there, *places)
+    own = Activity(moving.reshape(len(window), -1), there)
+    return (
+        replace(own, centre=camera.centre, rays=_rays(camera, GRID_WIDTH, height), width=GRID_WIDTH) if posed else own
+    )
 
 
 def _rays(camera: PinholeCamera, width: int, height: int) -> np.ndarray:

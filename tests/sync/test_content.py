@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from sync.content import Activity, Content, Offset, Window, find_offsets
-from tests.support.balls import camera_pose, covered, pixels_of
+from tests.support.balls import WIDTH, camera_pose, covered, pixels_of
 
 INSTANTS, REACH = 120, 8
 
 
 def seen_by(number: int, count: int, times: np.ndarray, *, lost: tuple[int, ...] = ()) -> Activity:
-    """What moves in the pictures of a camera that films at these times, in instants."""
+    """What moves in the pictures of a camera that films at these times, in instants: where balls were and are."""
     seen = covered(number, count, times)
     moving = np.zeros(seen.shape, np.float32)
-    moving[1:] = seen[1:] != seen[:-1]
+    moving[1:] = seen[1:] | seen[:-1]
     there = np.arange(len(times)) > 0
     there[list(lost)] = False
     moving[list(lost)] = 0
     turn, centre = camera_pose(number, count)
-    return Activity(moving, there, centre, (turn.T @ pixels_of()).T)
+    return Activity(moving, there, centre, (turn.T @ pixels_of()).T, WIDTH)
 
 
 def rig(count: int, late: dict[int, float] | None = None) -> dict[str, Activity]:
@@ -95,8 +95,8 @@ def test_motion_that_no_other_camera_sees_decides_nothing():
     assert not offsets["cam0"].decided
 
 
-def _place(own: Activity) -> tuple[np.ndarray, np.ndarray]:
-    return own.centre, own.rays
+def _place(own: Activity) -> tuple[np.ndarray | None, np.ndarray | None, int]:
+    return own.centre, own.rays, own.width
 
 
 def test_the_stretch_that_says_most_against_a_camera_is_told():

@@ -1,0 +1,6 @@
+"""When the cameras' pictures were filmed, by what they show (docs/sync.md)."""
+
+from sync.content.activity import Activity
+from sync.content.offsets import APART, Content, ContentOptions, Offset, Window, find_offsets
+
+__all__ = ["APART", "Activity", "Content", "ContentOptions", "Offset", "Window", "find_offsets"]

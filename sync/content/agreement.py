@@ -1,0 +1,52 @@
+"""How well two signals over time agree at every offset between them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+BLOCKS = 8
+"""Of instants that are left out in turn, which tells how sure an offset is"""
+WHILE = 21
+"""Instants over which a mean is taken that slow changes of how much moves do not enter"""
+LEAST_OVERLAP = 0.5
+"""Share of its instants that two signals must have in common at an offset that is tried"""
+
+
+def agreement(
+    first: np.ndarray, second: np.ndarray, there_first: np.ndarray, there_second: np.ndarray, reach: int
+) -> np.ndarray:
+    """Normalized correlation if the second signal shows so many instants later what the first one shows.
+
+    Args:
+        first, second: float [T, n].
+        there_first, there_second: bool [T], where they are known.
+        reach: largest offset, instants.
+
+    Returns:
+        float64 [2 reach + 1, BLOCKS], from -reach on, in parts by instants that add up; 0 without any change.
+    """
+    a, b = _centred(first, there_first), _centred(second, there_second)
+    scale = np.sqrt((a * a).sum() * (b * b).sum())
+    products, count = a @ b.T, len(a)
+    found = np.zeros((2 * reach + 1, BLOCKS))
+    if not scale:
+        return found
+    both = there_first.sum() * there_second.sum() / count
+    for offset in range(-reach, reach + 1):
+        start = max(0, -offset)
+        along = products.diagonal(offset)
+        blocks = np.arange(start, start + len(along)) * BLOCKS // count
+        overlap = int((there_first[start : start + len(along)] & there_second[start + offset :][: len(along)]).sum())
+        if overlap >= LEAST_OVERLAP * both:
+            found[offset + reach] = np.bincount(blocks, along, minlength=BLOCKS) * (both / (scale * overlap))
+    return found
+
+
+def _centred(barcode: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Less the mean of each line over a while, 0 at instants without a picture."""
+    known = np.where(there[:, None], barcode, 0.0)
+    sums = np.concatenate([np.zeros((1, barcode.shape[1] + 1)), np.cumsum(np.column_stack([known, there]), axis=0)])
+    middle = np.arange(len(there))
+    first, stop = np.maximum(middle - WHILE // 2, 0), np.minimum(middle + WHILE // 2 + 1, len(there))
+    around = sums[stop] - sums[first]
+    return np.where(there[:, None], known - around[:, :-1] / np.maximum(around[:, -1:], 1), 0.0)
