@@ -4,8 +4,9 @@
     packuv bench content runs/basketball runs/dome --out bench/results/content.json
 
 A run needs `motion` of all its instants; cameras that are held out are left out. For each camera in turn its times are
-moved by 1, 2 and 5 frames, forward and back by turns, all frames are matched anew, and what moves is compared as the stage `content`
-does. A miss is a camera that is not named with the right number of frames, a false alarm any other that is named.
+moved by 1, 2 and 5 frames, forward and back by turns, all frames are matched anew, and what moves is compared as the
+stage `content` does. A miss is a camera that is not named with the right number of frames, a false alarm any other that
+is named.
 """
 
 from __future__ import annotations

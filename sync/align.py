@@ -17,10 +17,10 @@ import numpy as np
 import pyarrow as pa
 from numba import njit
 
-from sync.clock import Clock, ClockMode, ClockState, fit_clock, measure_clock
+from sync.clock import Clock, ClockMode, ClockState, fit_clock, guess_drift, measure_clock
 from sync.probe import CONTAINER_TIMES
 from sync.timecode import Timecodes
-from sync.tree import FrameTree, merge_nearest, write_whole
+from sync.tree import FrameTree, merge_mutual, merge_nearest, write_whole
 
 SCHEMA = 1
 """Version of sync.json and groups.arrow."""
@@ -396,18 +396,15 @@ def _find_drifts(times: Mapping[str, np.ndarray], reference: str) -> dict[str, C
     """
     own, found = times[reference], dict[str, Clock]()
     period = frame_period(own)
+    some = own[:: 1 + len(own) // MOST_FRAMES]
     for camera, other in times.items():
-        if camera == reference or not period:
+        span = float(other[-1] - other[0])
+        if camera == reference or not period or abs(guess_drift(some, other, period)) * span < period / 8:
             continue
-        clock = fit_clock(own[:: 1 + len(own) // MOST_FRAMES], other, period)
-        if clock.state is ClockState.CORRECTED and _run_away(clock, other) > period / 4:
+        clock = fit_clock(some, other, period)
+        if clock.state is ClockState.CORRECTED and abs(clock.drift_ppm) * 1e-6 * span > period / 4:
             found[camera] = clock
     return found
-
-
-def _run_away(clock: Clock, times: np.ndarray) -> float:
-    """By how much a drift adds up over a recording, ns."""
-    return abs(clock.drift_ppm) * 1e-6 * float(times[-1] - times[0])
 
 
 def _never_complete(groups: FrameGroups, times: Mapping[str, np.ndarray], tolerance: int) -> str:
@@ -432,18 +429,13 @@ def _measure_clocks(groups: FrameGroups) -> dict[str, Clock]:
 
 def _match(index: Mapping[str, FrameTree], reference: str, tolerance: int, *, mutual: bool) -> FrameGroups:
     cameras, instants = tuple(index), index[reference].items()[0]
-    frames = np.full((len(instants), len(cameras)), -1, np.int32, order="F")  # they are filled by camera
-    residuals = np.zeros((len(instants), len(cameras)), np.int64, order="F")
+    frames = np.empty((len(instants), len(cameras)), np.int32, order="F")  # they are filled by camera
+    residuals = np.empty((len(instants), len(cameras)), np.int64, order="F")
+    merge = merge_mutual if mutual else merge_nearest
     for column, camera in enumerate(cameras):
         times, numbers = index[camera].items()
-        positions, away = merge_nearest(times, instants, tolerance)
-        found = np.flatnonzero(positions >= 0)
-        if mutual:
-            # ties the other way round, or cameras exactly half a frame apart would never find each other
-            back, _ = merge_nearest(instants, times, tolerance, tie_later=True)
-            found = found[back[positions[found]] == found]
-        frames[found, column] = numbers[positions[found]]
-        residuals[found, column] = away[found]
+        positions, residuals[:, column] = merge(times, instants, tolerance)
+        frames[:, column] = np.where(positions >= 0, numbers[positions], -1)
     return FrameGroups(cameras, reference, instants, frames, residuals)
 
 

@@ -130,13 +130,10 @@ def fit_clock(reference_ns: np.ndarray, camera_ns: np.ndarray, period_ns: int) -
         A clock that corrects nothing if the frames do not follow one trigger, are too few, or show no offset and
         drift above their noise. A drift below its noise is set to 0 and the offset fitted alone.
     """
-    positions, residuals = merge_nearest(camera_ns, reference_ns, period_ns)
-    matched = positions >= 0
-    times = reference_ns[matched]
-    if len(times) < FEWEST_FRAMES:
+    rough = _guess(reference_ns, camera_ns, period_ns)
+    if rough is None:
         return Clock(ClockState.TOO_FEW_FRAMES, int(reference_ns[0]))
-    origin = _middle(times)
-    offset, drift = _rough_line((times - origin).astype(np.float64), residuals[matched].astype(np.float64), period_ns)
+    origin, offset, drift = rough
     line = _refine(reference_ns, camera_ns, period_ns, origin, offset, drift)
     if line is None:
         return Clock(ClockState.TOO_FEW_FRAMES, origin)
@@ -147,6 +144,24 @@ def fit_clock(reference_ns: np.ndarray, camera_ns: np.ndarray, period_ns: int) -
         line = line if level is None else replace(level, drift_error=line.drift_error)
     significant = line.drift != 0 or abs(line.offset) > SIGNIFICANCE * line.offset_error
     return _clock(ClockState.CORRECTED if significant else ClockState.WITHIN_NOISE, origin, line)
+
+
+def guess_drift(reference_ns: np.ndarray, camera_ns: np.ndarray, period_ns: int) -> float:
+    """First estimate of `fit_clock`, ns gained per ns: a hundredth of its cost. 0 for too few frames."""
+    rough = _guess(reference_ns, camera_ns, period_ns)
+    return 0.0 if rough is None else rough[2]
+
+
+def _guess(reference_ns: np.ndarray, camera_ns: np.ndarray, period_ns: int) -> tuple[int, float, float] | None:
+    """Origin, offset there and drift; None for too few frames."""
+    positions, residuals = merge_nearest(camera_ns, reference_ns, period_ns)
+    matched = positions >= 0
+    times = reference_ns[matched]
+    if len(times) < FEWEST_FRAMES:
+        return None
+    origin = _middle(times)
+    x = (times - origin).astype(np.float64)
+    return origin, *_rough_line(x, residuals[matched].astype(np.float64), period_ns)
 
 
 @dataclass(frozen=True)

@@ -220,6 +220,15 @@ def merge_nearest(
     return positions, residuals
 
 
+def merge_mutual(keys: np.ndarray, times: np.ndarray, tolerance_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """`merge_nearest`, but only where each is the other's nearest; `times` must increase strictly, too."""
+    positions, residuals = merge_nearest(keys, times, tolerance_ns)
+    # ties the other way round, or two that are exactly half a period apart would never find each other
+    back, _ = merge_nearest(times, keys, tolerance_ns, tie_later=True)
+    _keep_mutual(positions, residuals, back)
+    return positions, residuals
+
+
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file so that it is there with all its bytes, or not at all, even after a power cut."""
     scratch = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -459,6 +468,13 @@ def _walk(
         found += 1
         node = right[node]
     return nodes[:found].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def _keep_mutual(positions: np.ndarray, residuals: np.ndarray, back: np.ndarray) -> None:
+    for i in range(positions.size):
+        if positions[i] >= 0 and back[positions[i]] != i:
+            positions[i], residuals[i] = -1, 0
 
 
 @njit(cache=True, error_model="numpy")
