@@ -212,10 +212,13 @@ def _placed(names: Sequence[str], found: Sequence[str], options: SolveOptions, w
     placed = [name for name in names if name in found]
     if len(placed) >= max(2, options.min_registered * len(names)):
         return placed
+    lost = [name for name in names if name not in placed]
+    few = len(lost) <= len(names) // 4
+    without = f"to go on without, write ignore = {json.dumps(lost)} into capture.toml; else " if few else ""
     raise ValueError(
         f"COLMAP must place {options.min_registered:.0%} of {len(names)} cameras so that the matches agree, but placed "
-        f"{len(placed)} ({placed}), not {[name for name in names if name not in placed]}; give more instants, pictures "
-        f"with more texture, or a calibration of your own (log: {workspace / 'mapper.log'})"
+        f"{len(placed)} ({placed}), not {lost}; {without}give more instants, pictures with more texture, or a "
+        f"calibration of your own (log: {workspace / 'mapper.log'})"
     )
 
 

@@ -24,7 +24,7 @@ from sync.clock import ClockMode
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig
+from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig, read_names
 from tasks.stages.clock import find_starts
 from tasks.stages.content import CompareContent
 from tasks.stages.encode import Encode, Verify
@@ -112,17 +112,23 @@ class Sequence:
         self.made.add(*self._chain(spans).pilot(first))
         scene = self.encoded()
         self._make(replace(scene, take=replace(scene.take, stop=self.plan.first + first.stop)))
-        return self.score(self.plan.held_out, self.judged or self.options.pictures)
+        return self.score(self.placed.held_out, self.judged or self.options.pictures)
 
     def encoded(self) -> Encode:
         """The scene file of the segments that are there."""
         return Encode(
-            take=replace(self._take("points"), cameras=tuple(self.plan.videos)),
-            held_out=self.plan.held_out,
+            take=replace(self._take("points"), cameras=tuple(self.placed.videos)),
+            held_out=self.placed.held_out,
             key=self.made.keys["key"][0],
             segments=tuple(self.made.keys["segment"]),
             options=self.options.encode,
         )
+
+    @property
+    def placed(self) -> Plan:
+        """The plan without cameras that a solved rig does without."""
+        rig = self.made.get("rig")
+        return self.plan if rig is None else self.plan.only(read_names(self.workshop.path(rig)))
 
     def _make(self, stage: Stage) -> Key:
         return self.made.add(self.submit(stage).result())
@@ -133,7 +139,7 @@ class Sequence:
             groups=self.made.only("sync"),
             rig=self.made.only(rig),
             light=self._light(),
-            cameras=self.plan.fitted,
+            cameras=self.placed.fitted,
             first=self.plan.first,
             stop=self.plan.stop,
             pictures=self.options.pictures,
@@ -158,8 +164,8 @@ class Sequence:
             self._make(MeasureLight(take=take, fitted=plan.fitted, options=self.options.light))
         else:
             self.workshop.listener.skipped("light", "light.enabled is false")
-        take = replace(filmed, rig=rig, light=self._light())
-        self._make(FindPoints(take=take, fitted=plan.fitted, options=self.options.points))
+        take = replace(filmed, cameras=tuple(self.placed.videos), rig=rig, light=self._light())
+        self._make(FindPoints(take=take, fitted=self.placed.fitted, options=self.options.points))
 
     def _light(self) -> Key | None:
         """Light and exposures over time; None where they are steady, so that nothing depends on how that was found."""
@@ -188,7 +194,7 @@ class Sequence:
         if not self.options.content.enabled:
             self.workshop.listener.skipped("content", "content.enabled is false")
             return
-        unseen, options = self.plan.held_out, self.options
+        unseen, options = self.placed.held_out, self.options
         self._make(
             CompareContent(
                 take=take, unseen=unseen, motion=motion, motion_options=options.motion, options=options.content
@@ -222,7 +228,7 @@ class Sequence:
         take = self._take("points")
         told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
         parts, motion = self._epochs(take, told, spans), self.made.only("motion")
-        return Chain(self.workshop, self.plan, self.options, self.submit, told, parts, motion)
+        return Chain(self.workshop, self.placed, self.options, self.submit, told, parts, motion)
 
     def _background(self, take: Take) -> Key | None:
         options = self.options.fit.background
@@ -256,7 +262,7 @@ class Sequence:
         return [Epoch(time.start, stills[number], backdrops[number]) for number, time in enumerate(times)]
 
     def _has_backdrop(self, take: Take, background: Key, spans: list[range]) -> bool:
-        pictures = count_pictures(self.workshop, self.plan, take.groups, [span.start for span in spans])
+        pictures = count_pictures(self.workshop, self.placed, take.groups, [span.start for span in spans])
         if reason := lacks_backdrop(self.workshop, background, max(pictures)):
             self.workshop.listener.skipped("backdrop", reason)
         return reason is None
@@ -265,7 +271,7 @@ class Sequence:
         return read_spans(self.workshop.path(self.made.only("keyframes")))
 
     def _preview(self, key: Key, segment: Key, number: int) -> Preview:
-        take = replace(self._take("points"), cameras=scored_cameras(self.plan, self.options.evaluate), stop=None)
+        take = replace(self._take("points"), cameras=scored_cameras(self.placed, self.options.evaluate), stop=None)
         return Preview(take=take, key=key, segment=segment, number=number)
 
     def _encode(self) -> None:
@@ -275,8 +281,8 @@ class Sequence:
         self._make(Verify(scene=self.made.only("encode"), segments=tuple(self.made.keys["segment"])))
 
     def _evaluate(self) -> None:
-        cameras = scored_cameras(self.plan, self.options.evaluate)
-        if not self.plan.held_out:
+        cameras = scored_cameras(self.placed, self.options.evaluate)
+        if not self.placed.held_out:
             why = f"no camera is held out; scored on fitted {', '.join(cameras)}"
             self.workshop.listener.skipped("unseen scores", why)
         self.score(cameras, self.judged or self.options.pictures)

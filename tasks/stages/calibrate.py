@@ -31,6 +31,8 @@ from tasks.stages.synchronize import read_videos
 
 CHECK, MATCHES, POINTS, COLOUR = "check.json", "matches.json", "points.npz", "colour.json"
 
+LEFT_OUT = "could not be placed by its pictures, so nothing is made of it; the others were (rig.solve.min_registered)"
+
 
 @dataclass(frozen=True)
 class RigOptions:
@@ -43,7 +45,7 @@ class RigOptions:
     trust: bool = False
     """Use a given calibration although the pictures contradict it"""
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
-    """A camera without a pose is of no use: all must be placed"""
+    """A camera without a pose is of no use: all must be placed, unless `min_registered` lets some be left out"""
     more_instants: int = 4
     """Instants, spread over the recording, to solve from, or to judge a calibration by, when one does not suffice"""
 
@@ -172,19 +174,31 @@ class SolveRig(Stage):
     def build(self, work: Work) -> Notes:
         footage, options = Footage(self.take, work.site), self.options
         instants = complete_instants(footage.load_groups(), self.take.cameras, self.first)
-        work.progress(0, 1, "COLMAP")
-        try:
-            rig = solve_rig(footage.filmed(instants[0]), options.solve, work.scratch)
-        except ValueError:
-            if options.more_instants == 1 or len(instants) == 1:
-                raise
-            chosen = instants[np.linspace(0, len(instants) - 1, options.more_instants).round().astype(int)]
-            work.progress(0, 1, f"COLMAP, {len(set(chosen.tolist()))} instants")
-            shots = [footage.filmed(instant) for instant in sorted(set(chosen.tolist()))]
+        rigs, problem = list[Rig](), None
+        for chosen in _attempts(instants, options.more_instants):
+            work.progress(0, 1, f"COLMAP, {len(chosen)} instant{'s' * (len(chosen) > 1)}")
+            shots = [footage.filmed(instant) for instant in chosen]
             pictures = {name: [shot[name] for shot in shots] for name in self.take.cameras}
-            rig = solve_rig(pictures, options.solve, work.scratch)
-        _save_rig(rig.select(self.take.cameras), options, {"source": rig.source}, work.out)
+            try:
+                rigs.append(solve_rig(pictures, options.solve, work.scratch))
+            except ValueError as error:
+                problem = error
+            if rigs and len(rigs[-1].cameras) == len(self.take.cameras):
+                break
+        if problem and not rigs:
+            raise problem
+        rig = max(rigs, key=lambda solved: len(solved.cameras))
+        kept = [name for name in self.take.cameras if name in rig.names]
+        left = {name: LEFT_OUT for name in self.take.cameras if name not in kept}
+        _save_rig(rig.select(kept), options, {"source": rig.source}, work.out, odd=left)
         return {"source": "COLMAP", "verdict": rig.source}
+
+
+def _attempts(instants: np.ndarray, more: int) -> list[list[int]]:
+    """Instants to solve from: the first, then some spread over the recording."""
+    spread = instants[np.linspace(0, len(instants) - 1, more).round().astype(int)]
+    several = sorted(set(spread.tolist()))
+    return [[int(instants[0])], several] if len(several) > 1 else [[int(instants[0])]]
 
 
 def find_rig(
@@ -219,6 +233,11 @@ def borrow_rig(
         rig=lender.files({RIG: lender.path(lent) / RIG}, "reading rig"),
         options=options,
     )
+
+
+def read_names(folder: Path) -> tuple[str, ...]:
+    """Cameras of the rig of an artefact."""
+    return Rig.load(folder / RIG).names
 
 
 def store_of(store: Path, sequence: str) -> Path:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 
@@ -33,6 +33,11 @@ class Plan:
             raise ValueError(
                 f"at least two cameras must be fitted, but of {len(self.videos)} only {len(self.fitted)} may be"
             )
+
+    def only(self, names: Collection[str]) -> Plan:
+        """With these cameras alone; raises ValueError where too few are left to fit."""
+        videos = {name: path for name, path in self.videos.items() if name in names}
+        return replace(self, videos=videos, held_out=tuple(name for name in self.held_out if name in videos))
 
     @property
     def fitted(self) -> tuple[str, ...]:

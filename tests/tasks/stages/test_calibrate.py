@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
+import av
 import numpy as np
 import pytest
 
 from calibration.accept import MatchesReport, Verdict
+from calibration.features import FeatureOptions
 from calibration.judge import SharedJudgement
 from calibration.moved import Standing
+from calibration.solve import Lens, SolveOptions
 from pipelines.events import Journal
+from sync.align import AlignOptions
 from sync.capture import find_capture
 from tasks.artefacts.jobs import Jobs
 from tasks.artefacts.originals import Originals
@@ -18,19 +23,24 @@ from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import (
+    CHECK,
     BorrowRig,
     FindPoints,
     PointOptions,
     RigOptions,
+    SolveRig,
     _KeptPictures,
     _lent,
     _moved,
     find_rig,
+    read_names,
     store_of,
 )
 from tasks.stages.footage import RIG, PictureOptions, Take
 from tasks.stages.plan import Plan
-from tests.support.artefacts import put
+from tasks.stages.synchronize import Synchronize
+from tests.support.artefacts import build_here, put
+from tests.support.calibration_scene import filmed
 
 NAMES = ("cam01", "cam02", "cam03", "cam04")
 STAGE = BorrowRig(
@@ -121,3 +131,40 @@ def test_colours_that_gain_nothing_are_said(tmp_path):
     assert list(stage.spared(tmp_path, notes)) == [("lens shading", "shading does not pay"), ("colour of cam02", "few")]
     plain = {**notes, "balanced": False, "reason": "no need", "unlike": {}}
     assert list(stage.spared(tmp_path, plain)) == [("colour balance", "no need")]
+
+
+@pytest.mark.slow
+def test_a_solve_goes_on_without_a_camera_where_that_is_allowed(tmp_path):
+    """Six cameras in a textured room, and one before whose lens the cap is."""
+    _, _, pictures = filmed(6)
+    pictures["capped"] = np.full_like(next(iter(pictures.values())), 20)
+    videos = tmp_path / "capture" / "videos"
+    videos.mkdir(parents=True)
+    for name, picture in pictures.items():
+        with av.open(str(videos / f"{name}.mkv"), "w") as container:
+            stream = container.add_stream("ffv1", rate=30)
+            stream.height, stream.width, stream.pix_fmt = *picture.shape[:2], "bgr0"
+            for _ in range(2):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode())
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    files = Files(dict.fromkeys(find_capture(site.capture).videos, "content"))
+    sync = Synchronize(videos=files, timecodes=Files({}), fps=None, timecode_column=None, options=AlignOptions())
+    _, made = build_here(sync, site, tmp_path / "sync")
+    groups = put(site, "sync", lambda out: [path.rename(out / path.name) for path in made.iterdir()])
+    solve = SolveOptions(features=FeatureOptions(max_features=800), lens=Lens.PINHOLE, shared_lens=True)
+    stage = SolveRig(
+        take=Take(groups=groups, cameras=tuple(find_capture(site.capture).videos)),
+        first=0,
+        options=RigOptions(solve=replace(solve, min_registered=0.8)),
+    )
+    _, out = build_here(stage, site, tmp_path / "solve")
+    assert set(read_names(out)) == pictures.keys() - {"capped"}
+    assert json.loads((out / CHECK).read_text())["suspicious"]["capped"].startswith("could not be placed")
+
+    plan = Plan(site.capture, find_capture(site.capture).videos, ("capped", "cam0"), 0, None, "cpu", True)
+    left = plan.only(read_names(out))
+    assert (left.held_out, len(left.fitted)) == (("cam0",), 5)
+
+    with pytest.raises(ValueError, match=r'to go on without, write ignore = \["capped"\] into capture.toml'):
+        build_here(replace(stage, options=RigOptions(solve=replace(solve, min_registered=1.0))), site, tmp_path / "all")
