@@ -1,10 +1,11 @@
-"""Clock: when the cameras filmed, by what moves in their pictures, for captures whose times tell nothing of it."""
+"""Clock: when the cameras filmed, by what they saw and heard, for captures whose times tell nothing of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from packuv.footage import LensCamera, Views
 from packuv.motion import MotionOptions, measure_motion
 from sync.capture import Capture, find_capture, load_timecodes, probe_capture
 from sync.content import APART, Activity, Offset, find_offsets
+from sync.content.sound import Sound, hear, starts_by_sound
+from sync.probe import VideoInfo
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import calibration_files
@@ -23,45 +26,59 @@ from tasks.stages.content import activity_of
 from tasks.stages.footage import lens_camera
 from tasks.stages.synchronize import STARTS
 
+Starts = dict[str, tuple[float, float]]
+"""When each camera began to film, and the error of that, seconds"""
 WINDOW_SECONDS = 20.0
 """Of each video are looked at, from its middle; offsets of up to half of it are found"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FindStarts(Stage):
-    """Find when each camera began to film, by what moves: starts.json, in seconds by camera."""
+    """Find when each camera began to film, by what moves or sounds: starts.json, in seconds by camera."""
 
     name, version = "clock", 1
     videos: Files
     timecodes: Files
     calibration: Files | None
-    """Which need not be right: without one, or with one that the pictures refute, whole pictures are compared"""
+    """Which need not be right: without one, or with one that the pictures refute, sound and whole pictures tell"""
     options: MotionOptions
 
     def build(self, work: Work) -> Notes:
         capture = find_capture(work.site.capture)
         infos = probe_capture(capture, work.progress)
         times = {name: codes.times_ns - codes.times_ns.min() for name, codes in load_timecodes(capture, infos).items()}
-        sizes = {name: (info.width, info.height) for name, info in infos.items()}
         frames, period_s = _rows(times)
-        offsets, by = {}, ""
-        for by, lenses in _lenses(capture, sizes, known=self.calibration is not None):
-            seen = self._activity(capture, frames, lenses, work, posed=by == "calibration")
-            offsets = find_offsets(seen, len(frames) // 2, paired=False)
-            if not _unsure(times, offsets):
-                break
-        if unsure := _unsure(times, offsets):
+        answers = self._answers(capture, infos, frames, period_s, work)
+        unsure, by, found = list(times), "", Starts()
+        while unsure and (answer := next(answers, None)):
+            by, found = answer
+            unsure = [name for name in times if name not in found or found[name][1] > APART * period_s]
+        if unsure:
             raise ValueError(
                 f"the pictures do not tell when {', '.join(unsure)} began to film: in their middle {WINDOW_SECONDS:g} "
-                "s too little moves that several cameras see, or they began further than half of that apart; give a "
-                "calibration, with which pictures tell more, or timecodes, cut the videos to about a common start, or "
-                "leave these cameras out with 'ignore' in capture.toml"
+                "s too little moves that several cameras see, or they began further than half of that apart, and they "
+                "have no sound in common; give a calibration, with which pictures tell more, or timecodes, cut the "
+                "videos to about a common start, or leave these cameras out with 'ignore' in capture.toml"
             )
-        first = min(offset.instants for offset in offsets.values())
-        starts = {name: round((offset.instants - first) * period_s, 6) for name, offset in offsets.items()}
-        errors = {name: round(offset.error * period_s, 6) for name, offset in offsets.items()}
+        first = min(start for start, _ in found.values())
+        starts = {name: round(start - first, 6) for name, (start, _) in found.items()}
+        errors = {name: round(error, 6) for name, (_, error) in found.items()}
         save_json(work.out / STARTS, {"by": by, "starts_s": starts, "errors_s": errors})
         return {"by": by, "cameras": len(starts), "latest_s": max(starts.values())}
+
+    def _answers(
+        self, capture: Capture, infos: Mapping[str, VideoInfo], frames: np.ndarray, period_s: float, work: Work
+    ) -> Iterator[tuple[str, Starts]]:
+        """What tells it, best first: lines and hulls of a calibrated rig, sound, then how much moves in pictures."""
+        sizes = {name: (info.width, info.height) for name, info in infos.items()}
+        posed = _calibrated(capture, sizes) if self.calibration is not None else None
+        if posed:
+            seen = self._activity(capture, frames, posed, work, posed=True)
+            yield "calibration", _starts(find_offsets(seen, len(frames) // 2, paired=False), period_s)
+        heard = {name: sound for name, video in capture.videos.items() if (sound := _heard(video)) is not None}
+        yield "sound", starts_by_sound(heard)
+        seen = self._activity(capture, frames, _filmed(sizes), work, posed=False)
+        yield "whole pictures", _starts(find_offsets(seen, len(frames) // 2, paired=False), period_s)
 
     def _activity(
         self, capture: Capture, frames: np.ndarray, lenses: list[LensCamera], work: Work, *, posed: bool
@@ -108,23 +125,27 @@ def _rows(times: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float]:
     return np.stack(columns, axis=1), period / 1e9
 
 
-def _lenses(
-    capture: Capture, sizes: Mapping[str, tuple[int, int]], *, known: bool
-) -> Iterator[tuple[str, list[LensCamera]]]:
-    """The cameras as calibrated, if they are, then as if nothing were known of them."""
-    if known and capture.calibration is not None:
-        with suppress(ValueError, OSError):  # the stage that imports it says what is wrong
-            rig: Rig = load_rig(capture.calibration, tuple(sizes), sizes)
-            yield "calibration", [lens_camera(camera) for camera in rig.resized(sizes).cameras]
-    yield (
-        "whole pictures",
-        [
-            LensCamera(PinholeCamera(name, width, height, width, width, width / 2, height / 2, np.eye(4)))
-            for name, (width, height) in sizes.items()
-        ],
-    )
+def _calibrated(capture: Capture, sizes: Mapping[str, tuple[int, int]]) -> list[LensCamera] | None:
+    """The cameras as they are said to stand; None where that cannot be read, which the stage that imports it tells."""
+    if capture.calibration is None:
+        return None
+    with suppress(ValueError, OSError):
+        rig: Rig = load_rig(capture.calibration, tuple(sizes), sizes).resized(sizes)
+        return [lens_camera(camera) for camera in rig.cameras]
+    return None
 
 
-def _unsure(names: Iterable[str], offsets: Mapping[str, Offset]) -> list[str]:
-    """Cameras of which the pictures do not tell the nearest frame."""
-    return [name for name in names if name not in offsets or offsets[name].error > APART]
+def _filmed(sizes: Mapping[str, tuple[int, int]]) -> list[LensCamera]:
+    """The cameras as if nothing were known of them: their pictures as they are."""
+    return [
+        LensCamera(PinholeCamera(name, width, height, width, width, width / 2, height / 2, np.eye(4)))
+        for name, (width, height) in sizes.items()
+    ]
+
+
+def _heard(video: Path) -> Sound | None:
+    return None if video.is_dir() else hear(video)
+
+
+def _starts(offsets: Mapping[str, Offset], period_s: float) -> Starts:
+    return {name: (offset.instants * period_s, offset.error * period_s) for name, offset in offsets.items()}

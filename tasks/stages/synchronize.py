@@ -21,7 +21,7 @@ from tasks.artefacts.workshop import Workshop
 STARTS = "starts.json"
 STARTS_NS = "starts_ns"
 """Key of the same in the header of a scene"""
-BY_CONTENT = "what moves in the pictures"
+BY_CONTENT = "what the cameras saw or heard"
 FOOTAGE = "footage"
 """Name of the notes on what was read of the videos, and what was not; missing where there are none"""
 

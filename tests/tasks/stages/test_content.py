@@ -16,6 +16,7 @@ from sync.align import AlignOptions, SyncReport
 from sync.capture import CaptureSettings, find_capture
 from sync.clock import ClockMode
 from sync.content import Content, ContentOptions, find_offsets
+from sync.content.sound import RATE
 from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key
 from tasks.report.facts import ReportInput
@@ -28,6 +29,7 @@ from tasks.stages.track import MOTION, FindMotion
 from tests.support.artefacts import build_here, put
 from tests.support.balls import FOCAL, camera_pose, covered
 from tests.support.balls import WIDTH as GRID
+from tests.support.sounds import recorded, room, write_video
 
 WIDTH, HEIGHT, FRAMES, COUNT = 160, 90, 80, 5
 NAMES = tuple(f"cam{number}" for number in range(COUNT))
@@ -164,7 +166,7 @@ def test_cameras_without_times_are_synchronized_by_their_pictures(tmp_path: Path
     groups = synchronized(site, tmp_path / "sync", found)
     report = json.loads((site.path(groups) / "sync.json").read_text())["report"]
     assert report["clock"] == "content"
-    assert {camera["source"] for camera in report["cameras"]} == {"what moves in the pictures"}
+    assert {camera["source"] for camera in report["cameras"]} == {"what the cameras saw or heard"}
     content = read_content(site.path(compared(site, tmp_path / "check", groups)))
     assert not lies_in(content)
 
@@ -191,8 +193,22 @@ def test_pictures_that_tell_nothing_are_no_clock(tmp_path: Path) -> None:
                     stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64, 3), 90, np.uint8), format="rgb24"))
                 )
             container.mux(stream.encode())
-    with pytest.raises(ValueError, match=r"do not tell when cam0, cam1, cam2 began to film.*; give a calibration"):
+    with pytest.raises(
+        ValueError, match=r"do not tell when cam0, cam1, cam2 began to film.*no sound in common; give a calibration"
+    ):
         find_starts(site, tmp_path / "clock", known=False)
+
+
+def test_cameras_that_hear_the_same_need_no_calibration(tmp_path: Path) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    (site.capture / "videos").mkdir(parents=True)
+    late = {"cam0": 2.0, "cam1": 0.5, "cam2": 3.25}
+    for number, (name, start) in enumerate(late.items()):
+        write_video(site.capture / "videos" / f"{name}.mkv", recorded(room(), start, number)[: 8 * RATE])
+    found = find_starts(site, tmp_path / "clock", known=False)
+    for name, start_ns in read_starts(site.path(found)).items():
+        assert start_ns / 1e9 == pytest.approx(late[name] - 0.5, abs=0.01)
+    assert json.loads((site.path(found) / "starts.json").read_text())["by"] == "sound"
 
 
 def test_the_clock_is_chosen_in_capture_toml() -> None:

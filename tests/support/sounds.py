@@ -1,0 +1,48 @@
+"""A room with sounds that several cameras record."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+
+from sync.content.sound import RATE
+
+SECONDS = 20
+
+
+def room(seed: int = 0) -> np.ndarray:
+    """Bursts of noise of any loudness and length, float [n] at RATE, and silence between them."""
+    rng = np.random.default_rng(seed)
+    sound = np.zeros((SECONDS + 12) * RATE)
+    for start in rng.uniform(0, SECONDS + 11, 90):
+        length = int(rng.uniform(0.02, 0.3) * RATE)
+        first = int(start * RATE)
+        sound[first : first + length] += rng.normal(0, rng.uniform(0.05, 0.5), length)
+    return sound
+
+
+def recorded(sound: np.ndarray, start_s: float, seed: int, noise: float = 0.02) -> np.ndarray:
+    first = round(start_s * RATE)
+    own = sound[first : first + SECONDS * RATE]
+    return own * np.random.default_rng(seed).uniform(0.2, 2) + np.random.default_rng(seed).normal(0, noise, len(own))
+
+
+def write_video(path: Path, samples: np.ndarray | None) -> None:
+    """A grey video of two seconds at 10 frames a second, with sound."""
+    with av.open(str(path), "w") as container:
+        picture = container.add_stream("ffv1", rate=10)
+        picture.width, picture.height, picture.pix_fmt = 32, 32, "bgr0"
+        voice = None if samples is None else container.add_stream("pcm_s16le", rate=RATE, layout="mono")
+        for _ in range(20):
+            grey = av.VideoFrame.from_ndarray(np.full((32, 32, 3), 90, np.uint8), format="rgb24")
+            container.mux(picture.encode(grey))
+        container.mux(picture.encode())
+        if voice is not None and samples is not None:
+            whole = (np.clip(samples, -1, 1) * 32767).astype(np.int16)
+            for start in range(0, len(whole), 1000):
+                part = av.AudioFrame.from_ndarray(whole[None, start : start + 1000], format="s16", layout="mono")
+                part.rate, part.pts = RATE, start
+                container.mux(voice.encode(part))
+            container.mux(voice.encode())

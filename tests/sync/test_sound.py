@@ -1,0 +1,67 @@
+"""Starts by sound: claps and speech that all cameras hear, each with noise of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sync.content import sound as module
+from sync.content.sound import RATE, Sound, hear, loudness, starts_by_sound
+from tests.support.sounds import SECONDS, recorded, room, write_video
+
+
+def heard_at(starts: dict[str, float]) -> dict[str, Sound]:
+    """What cameras that began at these times hear."""
+    return {
+        name: Sound(0.0, loudness(recorded(room(), start, number)))
+        for number, (name, start) in enumerate(starts.items())
+    }
+
+
+def test_recordings_of_one_room_tell_when_they_began():
+    starts = {"a": 3.0, "b": 0.0, "c": 7.25, "d": 3.5}
+    heard = heard_at(starts)
+    for name, (start, error) in starts_by_sound(heard).items():
+        assert start == pytest.approx(starts[name] - starts["a"], abs=0.002)
+        assert error <= 0.005
+
+
+def test_sound_that_begins_after_the_first_frame_counts_from_it():
+    heard = {"a": Sound(0.0, loudness(recorded(room(), 1.0, 1))), "b": Sound(0.25, loudness(recorded(room(), 3.0, 2)))}
+    assert starts_by_sound(heard)["b"][0] == pytest.approx(3.0 - 0.25 - 1.0, abs=0.002)
+
+
+def test_who_hears_something_else_or_nothing_is_missing():
+    heard = {
+        "a": Sound(0.0, loudness(recorded(room(), 1.0, 1))),
+        "elsewhere": Sound(0.0, loudness(recorded(room(7), 1.0, 3))),
+        "b": Sound(0.0, loudness(recorded(room(), 2.0, 2))),
+        "deaf": Sound(0.0, loudness(np.zeros(SECONDS * RATE))),
+        "short": Sound(0.0, loudness(np.ones(100))),
+    }
+    assert set(starts_by_sound(heard)) == {"a", "b"}
+    assert starts_by_sound({"a": heard["a"], "elsewhere": heard["elsewhere"]}) == {}
+    assert starts_by_sound({}) == {}
+
+
+def test_a_pair_that_agrees_by_echo_is_outvoted(monkeypatch):
+    starts = {"a": 1.0, "b": 2.0, "c": 3.0, "d": 4.0}
+    heard = heard_at(starts)
+    shifts = list(module._shifts(heard))
+    wrong = [(a, b, shift + (5.0 if (a, b) == ("a", "d") else 0.0)) for a, b, shift in shifts]
+    monkeypatch.setattr(module, "_shifts", lambda heard: iter(wrong))
+    for name, (start, _) in starts_by_sound(heard).items():
+        assert start == pytest.approx(starts[name] - 1.0, abs=0.005)
+
+
+def test_sound_is_read_from_videos(tmp_path):
+    samples = recorded(room(), 0.0, 0)[: 6 * RATE]
+    write_video(tmp_path / "a.mkv", samples)
+    write_video(tmp_path / "b.mkv", None)
+    sound = hear(tmp_path / "a.mkv")
+    assert sound is not None
+    assert sound.start_s == pytest.approx(0.0, abs=0.01)
+    assert len(sound.level) == pytest.approx(6000, abs=20)
+    expected = loudness(samples)[: len(sound.level)]
+    assert np.corrcoef(sound.level[: len(expected)], expected)[0, 1] > 0.95
+    assert hear(tmp_path / "b.mkv") is None
