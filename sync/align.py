@@ -497,8 +497,8 @@ def _common_notes(sync: SyncReport) -> list[str]:
         return []
     return [
         f"times of {_some(blind)} are those of the containers, which begin at 0 wherever a recording began: right "
-        "only if all cameras started at once or the files were cut to a common start; --clock content finds by pictures "
-        "and sound when each began"
+        "only if all cameras started at once or the files were cut to a common start; --clock content finds by "
+        "pictures and sound when each began"
     ]
 
 
