@@ -140,6 +140,8 @@ def _spared(capture: Capture, plan: Plan, options: SequenceOptions) -> Iterator[
         yield "light", "light.enabled is false"
     if not fit.background.instants:
         yield "backdrop", "fit.background.instants is 0"
+    if not options.content.enabled:
+        yield "content", "content.enabled is false"
     if not options.patches.enabled:
         yield "patches", "patches.enabled is false"
     if not options.motion.keep_flow:

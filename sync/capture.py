@@ -593,7 +593,7 @@ def _checked_offsets(path: Path, value: Any) -> dict[str, Decimal]:
         raise ValueError(f"{path}: time_offset_s must be a table of seconds by camera, but is {value!r}")
     for camera, seconds in value.items():
         number = isinstance(seconds, (int, Decimal)) and not isinstance(seconds, bool)
-        if not number or not abs(seconds) <= MOST_OFFSET_S:
+        if not number or not Decimal(seconds).is_finite() or abs(seconds) > MOST_OFFSET_S:
             raise ValueError(
                 f"{path}: time_offset_s of {camera!r} must be a number of seconds, at most {MOST_OFFSET_S} either "
                 f"way, but is {seconds!r}"

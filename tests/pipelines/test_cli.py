@@ -162,6 +162,13 @@ def test_arguments_become_a_request(tmp_path):
     )
 
 
+def test_what_times_are_worth_is_said_in_a_word() -> None:
+    asked = request_from(
+        parser().parse_args(["sync", "capture", "--out", "o", "--clock", "content", "--set", "sync.mutual=no"])
+    )
+    assert asked.settings == {"sync": {"clock": "content", "mutual": "no"}}
+
+
 def test_settings_name_their_file_and_their_clashes(tmp_path):
     config = tmp_path / "settings.toml"
     config.write_text("fit = 3\n")

@@ -218,7 +218,7 @@ def test_an_earlier_stop_and_another_seed(first, capture):
     stopped, _ = run(request(capture, out, stop_after="flow", seed=1))
     assert made(stopped) == set()  # nothing before the fit reads the seed
     assert stopped.scene is None
-    assert set(artefacts(stopped)) == {"sync", "rig", "light", "points", "motion", "patches", "keyframes"}
+    assert set(artefacts(stopped)) == {"sync", "rig", "light", "points", "motion", "content", "patches", "keyframes"}
 
 
 def test_light_may_be_left_out_and_changes_nothing_where_it_is_steady(first, capture, tmp_path):
@@ -227,7 +227,7 @@ def test_light_may_be_left_out_and_changes_nothing_where_it_is_steady(first, cap
     assert "less than 0.20%" in skipped["light of the instant"]
     without, _ = run(request(capture, tmp_path, settings={**SETTINGS, "light": {"enabled": False}}, stop_after="flow"))
     assert {event.label: event.reason for event in without.events}["light"] == "light.enabled is false"
-    assert set(artefacts(without)) == {"sync", "rig", "points", "motion", "patches", "keyframes"}
+    assert set(artefacts(without)) == {"sync", "rig", "points", "motion", "content", "patches", "keyframes"}
     keys = artefacts(outcome)
     assert all(keys[stage] == key for stage, key in artefacts(without).items())
 

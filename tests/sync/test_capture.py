@@ -2,6 +2,7 @@
 
 import doctest
 import unicodedata
+from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 
@@ -65,6 +66,7 @@ def test_settings_are_read(tmp_path: Path) -> None:
         calibration = "solve"
         timecode_column = "pts_ns"
         transfer = "slog3"
+        time_offset_s = { cam3 = -0.0333, cam10 = 2 }
     """
     files = (*VIDEOS, "videos/cam3.mp4", "calibration/transforms.json", "timecodes/cam1.txt", "timecodes/cam2.csv")
     capture = find_capture(make_capture(tmp_path, *files, settings=text))
@@ -79,6 +81,7 @@ def test_settings_are_read(tmp_path: Path) -> None:
     assert settings.clock is ClockMode.TRIGGERED
     assert settings.timecode_column == "pts_ns"
     assert settings.transfer == "slog3"
+    assert settings.time_offset_s == {"cam3": Decimal("-0.0333"), "cam10": 2}
 
 
 @pytest.mark.parametrize(
@@ -99,6 +102,11 @@ def test_settings_are_read(tmp_path: Path) -> None:
         ("ignore = ['cam1']\nreference = 'cam1'", r"\['cam1'\] cannot be ignored"),
         ("ignore = ['cam1', 'cam2']", "at least two cameras"),
         ("calibration = 'rig.json'", "calibration = 'rig.json', but .* is not there"),
+        ("time_offset_s = 3", "time_offset_s must be a table of seconds by camera, but is 3"),
+        ("time_offset_s = { cam1 = 'late' }", "time_offset_s of 'cam1' must be a number of seconds, .* but is 'late'"),
+        ("time_offset_s = { cam1 = nan }", "time_offset_s of 'cam1' must be a number of seconds"),
+        ("time_offset_s = { cam1 = 1e9 }", "time_offset_s of 'cam1' must be a number of seconds, at most 1000000"),
+        ("time_offset_s = { cam3 = 1 }", "time_offset_s names 'cam3', which has no video; did you mean 'cam"),
         ("calibration = 'solve'\nrig_from = 'take01'", "from rig_from or from calibration, not both"),
     ],
 )
