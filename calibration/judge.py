@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from calibration.accept import MatchesReport, PairMatches, Verdict, matches_report
-from calibration.doubt import doubts
+from calibration.doubt import WHOLE, doubts
 from calibration.features import Features, pairs_by_look
 from calibration.moved import Standing, find_moved
+from calibration.repair import repair
 from calibration.rig import Rig
 from calibration.triangulate import TriangulateOptions, choose_pairs, detect_all, verified_matches
 from calibration.turned import CLOCKWISE, upright, with_turns
@@ -52,12 +53,16 @@ class Judgement:
     """Matches of neighbouring cameras, found without the poses"""
     doubts: Mapping[str, str] = field(default_factory=dict)
     """What speaks against single cameras, or all of them (`calibration.doubt`)"""
+    mended: Mapping[str, str] = field(default_factory=dict)
+    """What was doubted, and is mended in `rig` (`calibration.repair`)"""
 
     def to_json(self) -> dict[str, Any]:
         given = self.given.to_json() if self.given else None
         turned = {"turned": dict(self.turned)} if self.turned else {}
         doubted = {"doubts": dict(self.doubts)} if self.doubts else {}
-        return {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given, **turned, **doubted}
+        mended = {"mended": dict(self.mended)} if self.mended else {}
+        facts = {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given}
+        return {**facts, **turned, **doubted, **mended}
 
 
 def judge(
@@ -97,6 +102,19 @@ def look_again(
         if not found:
             break
     return judgement
+
+
+def mend(judgement: Judgement, *, options: TriangulateOptions = _DEFAULTS) -> Judgement:
+    """The judgement with a rig in which what was doubted is mended, as far as the pictures tell how and confirm it."""
+    done = repair(judgement.rig, judgement.evidence, judgement.doubts.keys(), whole=WHOLE)
+    if not done.told:
+        return judgement
+    matches = matches_report(done.rig, judgement.evidence, options=options.judge)
+    left = doubts(done.rig, judgement.evidence, matches, judge=options.judge)
+    if not left.keys() < judgement.doubts.keys():
+        return judgement
+    mended = {name: f"was wrong, and is mended: {what}" for name, what in done.told.items() if name not in left}
+    return replace(judgement, rig=done.rig, matches=matches, doubts=left, mended=mended)
 
 
 def _looked(

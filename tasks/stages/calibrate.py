@@ -14,7 +14,7 @@ from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
 from calibration.colour import BalanceOptions, ColourReport, balance, with_colours
 from calibration.held_out import balance_held_out
 from calibration.importers import find_calibration, load_rig
-from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again
+from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again, mend
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
@@ -44,6 +44,8 @@ class RigOptions:
     explains a few percent, while few cameras before patterned walls let chance matches in (78 % in the demo)"""
     trust: bool = False
     """Use a given calibration although the pictures contradict it"""
+    repair: bool = True
+    """Mend cameras of a given calibration that the pictures doubt, where they tell how; it is said by name"""
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
     """A camera without a pose is of no use: all must be placed, unless `min_registered` lets some be left out"""
     more_instants: int = 4
@@ -100,7 +102,10 @@ class ImportRig(Stage):
             last = len(footage.load_groups().times_ns) - 1
             later = np.unique(np.linspace(self.first, last, self.options.more_instants + 1).round().astype(int))[1:]
             judgement = look_again(judgement, map(footage.filmed, later), options=self.options.judge)
-        odd = {**_turned(judgement), **_strays(capture, source), **judgement.doubts}
+        if judgement.doubts and self.options.repair and not self.options.trust:
+            work.progress(0, 1, "mending what the pictures doubt")
+            judgement = mend(judgement, options=self.options.judge)
+        odd = {**_turned(judgement), **_strays(capture, source), **judgement.doubts, **judgement.mended}
         _save_rig(judgement.rig, self.options, judgement.to_json(), work.out, odd=odd)
         held, verdict = f"{place} holds {kind}", judgement.matches.reason
         return {"source": "import", "given": held, "reading": judgement.reading.value, "verdict": verdict}
