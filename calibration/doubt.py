@@ -8,7 +8,7 @@ points that the others locate elsewhere (`calibration.moved`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,7 +40,11 @@ class DoubtOptions:
     """Matches with which a pair speaks for its cameras, where most of them fit: chance ones never do"""
     fitting: float = 0.6
     """Share of them that must"""
-
+    alibis: int = 3
+    """Pairs that clear a camera, whatever others say, if nearly all of their many matches fit: chance lets two cameras
+    that see little in common agree on a geometry of its own, never three on the given one"""
+    alibi_matches: int = 100
+    alibi_fitting: float = 0.9
     better: float = 0.6
     """Share of the median distance that other lenses leave at most, to be believed"""
     noise_px: float = 0.15
@@ -67,7 +71,7 @@ def doubts(
         return {WHOLE: f"is neither confirmed nor refuted by the pictures: {report.reason}"}
     pairs = _medians_px(rig, evidence, judge.min_matches)
     known = _confirming_px(rig, evidence, judge, options) | pairs
-    off, left = _peeled(rig, known, options)
+    off, left = _peeled(rig, known, _cleared(rig, evidence, judge, options), options)
     found = {name: f"lies {px:.1f} px off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
              for name, px in off.items()}  # fmt: skip
     standings, moved = find_moved(rig, evidence)
@@ -123,7 +127,21 @@ def _errors_px(rig: Rig, evidence: Sequence[PairMatches]) -> dict[frozenset[str]
     return {key: np.concatenate(found) for key, found in errors.items()}
 
 
-def _peeled(rig: Rig, pairs: Medians, options: DoubtOptions) -> tuple[dict[str, float], Medians]:
+def _cleared(rig: Rig, evidence: Sequence[PairMatches], judge: MatchOptions, options: DoubtOptions) -> set[str]:
+    """Cameras with an alibi: several others confirm them beyond doubt."""
+    sure = [
+        key
+        for key, found in _errors_px(rig, evidence).items()
+        if len(found) >= options.alibi_matches
+        and (found <= judge.max_error_px).mean() >= options.alibi_fitting
+        and np.median(found) <= min(options.limit_px(rig[name].width) for name in key)
+    ]
+    return {name for name in rig.names if sum(name in key for key in sure) >= options.alibis}
+
+
+def _peeled(
+    rig: Rig, pairs: Medians, cleared: Collection[str], options: DoubtOptions
+) -> tuple[dict[str, float], Medians]:
     """Cameras that lie off, the worst first, each judged without those before it; and the pairs of the others.
 
     A wrong camera spoils all of its own pairs, but only one of each neighbour's. Half of the cameras at most: beyond
@@ -132,7 +150,8 @@ def _peeled(rig: Rig, pairs: Medians, options: DoubtOptions) -> tuple[dict[str, 
     left, off = dict(pairs), dict[str, float]()
     while left and 2 * (len(off) + 1) <= len(rig.cameras):
         own = {name: {key: px for key, px in left.items() if name in key} for name in rig.names}
-        each = {name: _usual(pairs) for name, pairs in own.items() if _accused(rig[name], pairs, options)}
+        accused = [name for name, pairs in own.items() if _accused(rig[name], pairs, options)]
+        each = {name: _usual(own[name]) for name in accused if name not in cleared}
         if not each:
             break
         worst = max(each, key=lambda name: each[name])
