@@ -7,6 +7,7 @@ cameras that stand apart agree to about a frame, not better.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations, islice
 from pathlib import Path
@@ -50,18 +51,16 @@ def hear(video: Path) -> Sound | None:
         first_s = float(min(shown, default=0) * (picture.time_base or 0))
     with av.open(str(video)) as container:
         stream, resampler = container.streams.audio[0], av.AudioResampler("flt", "mono", RATE)
-        begins, parts, count = None, [], 0
-        for frame in container.decode(stream):
-            if begins is None:
-                begins = float(frame.time or 0.0)
-            for piece in resampler.resample(frame):
-                parts.append(piece.to_ndarray().ravel())
-                count += parts[-1].size
-            if count >= MOST_SECONDS * RATE:
-                break
-    if begins is None:
-        return None
-    return Sound(begins - first_s, loudness(np.concatenate([*parts, np.zeros(0, np.float32)])))
+        begins, parts, count = None, [np.zeros(0, np.float32)], 0
+        with suppress(av.FFmpegError):  # damaged from there on
+            for frame in container.decode(stream):
+                begins = float(frame.time or 0.0) if begins is None else begins
+                for piece in resampler.resample(frame):
+                    parts.append(piece.to_ndarray().ravel().astype(np.float32))
+                    count += parts[-1].size
+                if count >= MOST_SECONDS * RATE:
+                    break
+    return None if begins is None else Sound(begins - first_s, loudness(np.concatenate(parts)))
 
 
 def loudness(samples: np.ndarray) -> np.ndarray:

@@ -109,18 +109,19 @@ def find_starts(workshop: Workshop, options: MotionOptions) -> FindStarts:
 
 def _rows(times: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float]:
     """Frames int [T, C] that would be of one moment had all cameras begun at once, and the seconds between rows."""
-    period = float(np.median([np.median(np.diff(np.sort(own))) for own in times.values() if len(own) > 1]))
+    alone = [name for name, own in times.items() if len(own) < 2]
+    if alone:
+        raise ValueError(f"a camera needs two frames or more to tell when it began, but {', '.join(alone)} has one")
+    period = float(np.median([np.median(np.diff(np.sort(own))) for own in times.values()]))
     shortest = min(float(own.max()) for own in times.values())
     span = min(shortest, WINDOW_SECONDS * 1e9)
     grid = (shortest - span) / 2 + np.arange(int(span / period) + 1) * period
     columns = []
     for own in times.values():
         order = np.argsort(own, kind="stable")
-        after = np.clip(np.searchsorted(own[order], grid), 1, max(1, len(own) - 1))
-        nearer = np.where(
-            grid - own[order][after - 1] <= own[order][after % len(own)] - grid, after - 1, after % len(own)
-        )
-        found = order[nearer]
+        after = np.clip(np.searchsorted(own[order], grid), 1, len(own) - 1)
+        before = after - 1
+        found = order[np.where(grid - own[order][before] <= own[order][after] - grid, before, after)]
         columns.append(np.where(np.abs(own[found] - grid) <= period / 2, found, -1))
     return np.stack(columns, axis=1), period / 1e9
 
