@@ -256,10 +256,20 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
         ValueError: some cameras have timecode files and others have not (their times would not be comparable), a file
             does not parse, or its lines do not fit the frames of the video.
     """
+    return with_offsets(capture, _told_timecodes(capture, infos))
+
+
+def load_durations(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
+    """The same of cameras whose times tell only how long they have filmed: without what `time_offset_s` adds."""
+    return _told_timecodes(capture, infos)
+
+
+def with_offsets(capture: Capture, timecodes: Mapping[str, Timecodes]) -> dict[str, Timecodes]:
+    """Timecodes with what `time_offset_s` in capture.toml adds to them."""
     moves = capture.settings.time_offset_s
     return {
         camera: codes.moved(int(moves[camera] * NANOSECONDS)) if moves.get(camera) else codes
-        for camera, codes in _told_timecodes(capture, infos).items()
+        for camera, codes in timecodes.items()
     }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from packuv.camera import PinholeCamera
 from packuv.files import save_json
 from packuv.footage import LensCamera, Views
 from packuv.motion import MotionOptions, measure_motion
-from sync.capture import Capture, find_capture, load_timecodes, probe_capture
+from sync.capture import Capture, find_capture, load_durations, probe_capture
 from sync.content import APART, Activity, Offset, find_offsets
 from sync.content.sound import Sound, hear, starts_by_sound
 from sync.probe import VideoInfo
@@ -41,24 +42,33 @@ class FindStarts(Stage):
     timecodes: Files
     calibration: Files | None
     """Which need not be right: without one, or with one that the pictures refute, sound and whole pictures tell"""
+    fps: Fraction | None = None
+    """What capture.toml says"""
+    timecode_column: str | None = None
+    """Likewise"""
     options: MotionOptions
 
     def build(self, work: Work) -> Notes:
         capture = find_capture(work.site.capture)
+        said = capture.settings
+        if (said.fps, said.timecode_column) != (self.fps, self.timecode_column):
+            raise ValueError(f"settings of {capture.folder} changed while they were read; run the command again")
         infos = probe_capture(capture, work.progress)
-        times = {name: codes.times_ns - codes.times_ns.min() for name, codes in load_timecodes(capture, infos).items()}
+        times = {name: codes.times_ns - codes.times_ns.min() for name, codes in load_durations(capture, infos).items()}
         frames, period_s = _rows(times)
         answers = self._answers(capture, infos, frames, period_s, work)
         unsure, by, found = list(times), "", Starts()
         while unsure and (answer := next(answers, None)):
-            by, found = answer
-            unsure = [name for name in times if name not in found or found[name][1] > APART * period_s]
+            left = [name for name in times if name not in answer[1] or answer[1][name][1] > APART * period_s]
+            if not by or len(left) < len(unsure):
+                unsure, (by, found) = left, answer
         if unsure:
+            cure = "give " if self.calibration else "give a calibration, with which pictures tell more, or "
             raise ValueError(
                 f"the pictures do not tell when {', '.join(unsure)} began to film: in their middle {WINDOW_SECONDS:g} "
                 "s too little moves that several cameras see, or they began further than half of that apart, and they "
-                "have no sound in common; give a calibration, with which pictures tell more, or timecodes, cut the "
-                "videos to about a common start, or leave these cameras out with 'ignore' in capture.toml"
+                f"have no sound in common; {cure}timecodes, cut the videos to about a common start, or leave these "
+                "cameras out with 'ignore' in capture.toml"
             )
         first = min(start for start, _ in found.values())
         starts = {name: round(start - first, 6) for name, (start, _) in found.items()}
@@ -97,12 +107,14 @@ class FindStarts(Stage):
 def find_starts(workshop: Workshop, options: MotionOptions) -> FindStarts:
     """The stage for a capture whose cameras began at times that nobody noted."""
     capture = workshop.capture
-    source = capture.calibration
+    source = None if capture.settings.rig_from else capture.calibration  # which a take with another's rig passes over
     files = None if source is None else workshop.files(calibration_files(source), "reading calibration")
     return FindStarts(
         videos=workshop.files(capture.videos, "reading videos"),
         timecodes=workshop.files(capture.timecodes, "reading timecodes"),
         calibration=files,
+        fps=capture.settings.fps,
+        timecode_column=capture.settings.timecode_column,
         options=replace(options, keep_flow=False),
     )
 

@@ -148,9 +148,10 @@ def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
         tolerance_ns = whole(tolerance_ns, f"{what}: tolerance_ns", most=MOST_NS)
     options = AlignOptions(reference=reference, tolerance_ns=tolerance_ns, clock=ClockMode(clock))
     timecodes = load_timecodes(found, infos)
-    if options.clock is ClockMode.CONTENT:
+    if options.clock is ClockMode.CONTENT:  # the starts have what time_offset_s added in them
         starts = fields(field(sync, STARTS_NS, what), f"{what}: {STARTS_NS}")
-        known = {name: whole(starts.get(name), f"{what}: {STARTS_NS}: {name}", most=MOST_NS) for name in timecodes}
+        names = {name: f"{what}: {STARTS_NS}: {name}" for name in timecodes}
+        known = {name: whole(starts.get(name), said, least=-MOST_NS, most=MOST_NS) for name, said in names.items()}
         timecodes = begun(timecodes, known)
     return align(timecodes, options)[0]
 

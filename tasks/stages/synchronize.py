@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from sync.align import AlignOptions, FrameGroups, SyncReport, align, build_index, save_index
-from sync.capture import Capture, find_capture, load_timecodes, picture_notes, probe_capture
+from sync.capture import (
+    Capture,
+    find_capture,
+    load_durations,
+    load_timecodes,
+    picture_notes,
+    probe_capture,
+    with_offsets,
+)
 from sync.probe import VideoInfo
 from sync.timecode import Timecodes
 from tasks.artefacts.recipe import write_json
@@ -48,9 +56,11 @@ class Synchronize(Stage):
         found = find_capture(work.site.capture)
         self._check(found)
         infos = probe_capture(found, work.progress)
-        timecodes = load_timecodes(found, infos)
-        if self.starts is not None:
-            timecodes = begun(timecodes, read_starts(work.path(self.starts)))
+        if self.starts is None:
+            timecodes = load_timecodes(found, infos)
+        else:
+            starts = read_starts(work.path(self.starts))
+            timecodes = with_offsets(found, begun(load_durations(found, infos), starts))
         groups, report = align(timecodes, self.options)
         groups.save(work.out, report)
         save_index(build_index(timecodes, report.clocks), work.out)

@@ -24,7 +24,7 @@ from tasks.report.findings import findings
 from tasks.stages.clock import FindStarts
 from tasks.stages.content import CompareContent, choose_windows, read_content
 from tasks.stages.footage import RIG, Take
-from tasks.stages.synchronize import Synchronize, read_starts
+from tasks.stages.synchronize import Synchronize, read_starts, starts_of
 from tasks.stages.track import MOTION, FindMotion
 from tests.support.artefacts import build_here, put
 from tests.support.balls import FOCAL, camera_pose, covered
@@ -202,13 +202,42 @@ def test_pictures_that_tell_nothing_are_no_clock(tmp_path: Path) -> None:
 def test_cameras_that_hear_the_same_need_no_calibration(tmp_path: Path) -> None:
     site = Site(tmp_path / "store", tmp_path / "capture", 1)
     (site.capture / "videos").mkdir(parents=True)
-    late = {"cam0": 2.0, "cam1": 0.5, "cam2": 3.25}
+    late = {"cam0": 0.8, "cam1": 0.5, "cam2": 1.25}
     for number, (name, start) in enumerate(late.items()):
         write_video(site.capture / "videos" / f"{name}.mkv", recorded(room(), start, number)[: 8 * RATE])
     found = find_starts(site, tmp_path / "clock", known=False)
     for name, start_ns in read_starts(site.path(found)).items():
         assert start_ns / 1e9 == pytest.approx(late[name] - 0.5, abs=0.01)
+    before = starts_of(SyncReport.load(site.path(started(site, tmp_path / "sync", found, tuple(late)))))
+    (site.capture / "capture.toml").write_text("time_offset_s = { cam1 = 0.1 }")
+    after = starts_of(SyncReport.load(site.path(started(site, tmp_path / "moved", found, tuple(late)))))
+    assert {name: after[name] - before[name] for name in late} == {"cam0": 0, "cam1": 100_000_000, "cam2": 0}
     assert json.loads((site.path(found) / "starts.json").read_text())["by"] == "sound"
+
+
+def started(site: Site, folder: Path, starts: Key, names: tuple[str, ...]) -> Key:
+    said = find_capture(site.capture).settings.time_offset_s
+    return _made(
+        Synchronize(
+            videos=Files(dict.fromkeys(names, "content")),
+            timecodes=Files({}),
+            fps=None,
+            timecode_column=None,
+            time_offset_s={name: str(seconds) for name, seconds in said.items()},
+            starts=starts,
+            options=AlignOptions(clock=ClockMode.CONTENT),
+        ),
+        site,
+        folder,
+    )
+
+
+def test_starts_are_of_the_settings_by_which_times_are_read(tmp_path: Path) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    film(site.capture, {})
+    (site.capture / "capture.toml").write_text("fps = 60")
+    with pytest.raises(ValueError, match=r"settings of .* changed while they were read"):
+        find_starts(site, tmp_path / "clock", known=False)
 
 
 def test_the_clock_is_chosen_in_capture_toml() -> None:
