@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 
 from calibration.importers.texts import about, read_text
 from calibration.importers.views import PIXEL_CENTRE, Reading, Videos, View, intrinsics, lens, pose
@@ -14,9 +17,11 @@ from calibration.rig import Camera
 
 KIND = "intri.yml and extri.yml"
 BESIDE = ("intri.yml", "extri.yml", "intri.yaml", "extri.yaml", "t_offsets.json")
-_MOST_DEPTH = 64
-_DEEP_LINE = re.compile(r"^(?:[ \t]*-[ \t]){64}|^[ \t]{256}", re.MULTILINE)
-"""More lists in one another than belong on a line, or as much white space as deep nesting needs"""
+_DIRECTIVE = re.compile(r"\A\s*%YAML:[\d.]+[^\n]*")
+"""OpenCV's first line, which a YAML parser takes for an unknown one"""
+
+Storage = Mapping[str, Any]
+"""What a file holds: texts, lists of them, and mappings; OpenCV's own parser is not asked, since damage aborts it"""
 
 
 def claims(file: Path) -> bool:
@@ -30,7 +35,7 @@ def read(file: Path, videos: Videos) -> Reading:
             raise FileNotFoundError(f"an EasyMocap calibration is intri.yml and extri.yml side by side, but no {path}")
     with about(intri):
         lenses = _storage(intri)
-        names = _listed(lenses, read_text(intri))
+        names = _listed(lenses)
     with about(extri):
         poses = _storage(extri)
         placed = {name: _pose(name, poses) for name in names}
@@ -39,54 +44,49 @@ def read(file: Path, videos: Videos) -> Reading:
         return Reading([view for view in found if view is not None])
 
 
-def _listed(lenses: cv2.FileStorage, text: str) -> list[str]:
-    """The names that are listed, or, where these are missing or were taken for numbers, those of the matrices."""
-    node = lenses.getNode("names")
-    items = [node.at(index) for index in range(node.size())] if node.isSeq() else []
-    names = [item.string() for item in items if item.isString()]
-    if not names or len(names) < len(items):
-        names = re.findall(r"^K_(.+?)[ \t]*:", text, re.MULTILINE)
+def _listed(lenses: Storage) -> list[str]:
+    """The names that are listed, or, where none are, those of the matrices."""
+    listed = lenses.get("names")
+    names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
+    names = names or [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
     if not names:
         raise ValueError("intri.yml must list its cameras under names")
     return names
 
 
-def _storage(path: Path) -> cv2.FileStorage:
-    text = read_text(path)
-    _check_nesting(path, text)
+def _storage(path: Path) -> Storage:
+    """Every scalar stays text: 01 and 1e3 are names as well as numbers."""
     try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except (cv2.error, SystemError):  # OpenCV's bindings wrap the parser's error in a SystemError that says nothing
-        storage = None
-    if storage is None or not storage.isOpened():
-        raise ValueError(f"{path.name} is no YAML file of OpenCV")
-    return storage
+        found = yaml.load(_DIRECTIVE.sub("", read_text(path)), yaml.BaseLoader)
+    except RecursionError:
+        raise ValueError(f"{path.name} is nested too deep to be a calibration") from None
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path.name} is no YAML file of OpenCV: {_where(error)}") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path.name} is no YAML file of OpenCV, which names matrices")
+    return found
 
 
-def _check_nesting(path: Path, text: str) -> None:
-    """OpenCV's parser goes as deep as a file does, until the stack ends and with it the program."""
-    depth = 0
-    for mark in re.finditer(r"[][{}]", text):
-        depth += 1 if mark[0] in "[{" else -1
-        if depth > _MOST_DEPTH:
-            raise ValueError(f"{path.name} may be nested {_MOST_DEPTH} deep at most, but goes deeper")
-    if _DEEP_LINE.search(text):
-        raise ValueError(f"{path.name} may be nested {_MOST_DEPTH} deep at most, but goes deeper")
+def _where(error: yaml.YAMLError) -> str:
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None) or getattr(error, "reason", None) or "it cannot be read"
+    return str(problem) if mark is None else f"{problem}, line {mark.line + 1}"
 
 
-def _pose(name: str, poses: cv2.FileStorage) -> np.ndarray:
-    found = poses.getNode(f"Rot_{name}").mat()
-    if found is None:
+def _pose(name: str, poses: Storage) -> np.ndarray:
+    if f"Rot_{name}" in poses:
+        found = _matrix(poses, f"Rot_{name}", (3, 3))
+    else:
         found = cv2.Rodrigues(_matrix(poses, f"R_{name}", (3, 1)))[0]
     return pose(np.asarray(found, dtype=np.float64), _matrix(poses, f"T_{name}", (3, 1)), f"camera {name!r}")
 
 
-def _view(name: str, lenses: cv2.FileStorage, placed: np.ndarray, videos: Videos) -> View | None:
+def _view(name: str, lenses: Storage, placed: np.ndarray, videos: Videos) -> View | None:
     """None for a camera without a video, whose picture size nobody knows."""
     what = f"camera {name!r}"
     fx, fy, cx, cy = intrinsics(_matrix(lenses, f"K_{name}", (3, 3)), what)
-    terms = next((mat for key in ("D", "dist") if (mat := lenses.getNode(f"{key}_{name}").mat()) is not None), ())
-    width, height = (round(lenses.getNode(f"{axis}_{name}").real()) for axis in "WH")
+    terms = next((_numbers(lenses, key) for key in (f"D_{name}", f"dist_{name}") if key in lenses), np.empty(0))
+    width, height = (_length(lenses, f"{axis}_{name}") for axis in "WH")
     if not (height >= 1 and width >= 1):
         if not videos.sizes:
             raise ValueError(
@@ -98,12 +98,34 @@ def _view(name: str, lenses: cv2.FileStorage, placed: np.ndarray, videos: Videos
             return None
         width, height = size
     cx, cy = cx + PIXEL_CENTRE, cy + PIXEL_CENTRE
-    return View((name,), Camera("", width, height, fx, fy, cx, cy, placed, lens(np.ravel(terms))))
+    return View((name,), Camera("", width, height, fx, fy, cx, cy, placed, lens(terms)))
 
 
-def _matrix(storage: cv2.FileStorage, key: str, shape: tuple[int, int]) -> np.ndarray:
+def _length(lenses: Storage, key: str) -> int:
+    """0 where it is not given."""
+    try:
+        return round(float(lenses.get(key, 0)))
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{key} must be a number of pixels, but is {lenses[key]!r}"[:200]) from None
+
+
+def _matrix(storage: Storage, key: str, shape: tuple[int, int]) -> np.ndarray:
     """float64 of this shape; a row stands for a column too."""
-    found = storage.getNode(key).mat()
-    if found is None or found.size != shape[0] * shape[1]:
+    numbers = _numbers(storage, key) if key in storage else np.empty(0)
+    if numbers.size != shape[0] * shape[1]:
         raise ValueError(f"{key} must be a matrix of {shape[0]} x {shape[1]} numbers")
-    return np.asarray(found, dtype=np.float64).reshape(shape)
+    return numbers.reshape(shape)
+
+
+def _numbers(storage: Storage, key: str) -> np.ndarray:
+    """float64 (N,): an opencv-matrix's data, as many as its rows and columns ask for, or a plain list."""
+    found = storage[key]
+    try:
+        data = found["data"] if isinstance(found, dict) else found
+        numbers = np.array([float(number) for number in data], dtype=np.float64)
+        asked = int(found["rows"]) * int(found["cols"]) if isinstance(found, dict) else numbers.size
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"{key} must be a matrix of OpenCV: rows, cols and data") from None
+    if numbers.size != asked:
+        raise ValueError(f"{key} must hold rows times cols = {asked} numbers, but has {numbers.size}")
+    return numbers

@@ -546,11 +546,32 @@ def test_webcams_of_both_caliscope_layouts(data):
     )
 
 
-@pytest.mark.parametrize(
-    "deep", ["names: " + "[" * 1000 + "]" * 1000, "- " * 1000 + "1", "names:\n" + " " * 1000 + "- a"]
-)
-def test_yaml_that_is_nested_too_deep_for_its_parser_is_refused(tmp_path, deep):
+@pytest.mark.parametrize("deep", ["names: " + "[" * 1000 + "]" * 1000, "- " * 1000 + "1", "? " * 1_000_000])
+def test_yaml_that_is_nested_too_deep_is_refused(tmp_path, deep):
     for name in ("intri.yml", "extri.yml"):
         (tmp_path / name).write_text(f"%YAML:1.0\n---\n{deep}\n")
-    with pytest.raises(ValueError, match="may be nested 64 deep at most, but goes deeper"):
+    with pytest.raises(ValueError, match="nested too deep"):
+        load_rig(tmp_path, ("cam1", "cam2"))
+
+
+@pytest.mark.parametrize(
+    ("was", "now"),
+    [
+        ("rows: 3", "rows: 999999999"),
+        ("rows: 3", "rows: -3"),
+        ("rows: 3", "rows: three"),
+        ("cols: 3", ""),
+        ("data: [", "data: [ 1., "),
+        ("data: [", "data: [ x, "),
+        ("data: [", "data: [ [1.], "),
+        ("data: [", "dote: ["),
+    ],
+)
+def test_a_damaged_matrix_of_opencv_is_refused(tmp_path, was, now):
+    """OpenCV's own parser ends the program at some of them."""
+    write_easymocap(tmp_path, ring(2))
+    text = (tmp_path / "intri.yml").read_text()
+    assert was in text
+    (tmp_path / "intri.yml").write_text(text.replace(was, now, 1))
+    with pytest.raises(ValueError, match=r"K_cam\d+ must "):
         load_rig(tmp_path, ("cam1", "cam2"))
