@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -12,15 +12,17 @@ from sync.content.agreement import BLOCKS, LEAST_OVERLAP
 from sync.content.barcodes import Agreements, compare_pairs
 from sync.content.hull import compare_with_hull
 
-HULL_WEIGHT = 10.0
-"""What the hull of all others counts against the barcodes of one other camera"""
-DECIDED = 1 / 3
-"""Standard error, in instants, up to which an offset is told: three of them make one frame"""
-APART = 0.5
-"""Offset in instants from which another frame would have been nearer"""
-SIGNIFICANCE = 3.0
+APART = 2 / 3
+"""Offset in instants from which a camera is said to be off: a whole frame, less what is measured too little"""
+SIGNIFICANCE = 2.0
 """Standard errors by which an offset must differ from what the times say"""
+DECIDED = 0.4
+"""Standard error, in instants, up to which a camera's times are taken to be looked at"""
+CLEAR = 1.75
+"""Standard errors by which pictures must agree better at an offset than two instants beside, or it is chance"""
 LEAST_ERROR = 0.02
+SUSPECTS = 4
+"""Cameras of which each is tried as the one that lies"""
 
 
 @dataclass(frozen=True)
@@ -53,11 +55,13 @@ class Offset:
     """Standard error, from instants and from cameras left out in turn"""
     expected: float = 0.0
     """What its times say, by their residuals"""
+    clear: float = np.inf
+    """By how many standard errors pictures agree better there than two instants beside"""
 
     @property
     def decided(self) -> bool:
-        """Whether a whole frame would have been noticed."""
-        return self.error <= DECIDED
+        """Whether a whole frame would have been noticed, or more has been."""
+        return self.lies or (self.clear >= CLEAR and self.error <= DECIDED)
 
     @property
     def away(self) -> float:
@@ -66,11 +70,11 @@ class Offset:
 
     @property
     def lies(self) -> bool:
-        """Whether the pictures refute the times, by half a frame or more."""
-        return self.decided and abs(self.away) > max(APART, SIGNIFICANCE * self.error)
+        """Whether the pictures refute the times, by a frame or more."""
+        return self.clear >= CLEAR and abs(self.away) > max(APART, SIGNIFICANCE * self.error)
 
     def to_json(self) -> dict[str, float]:
-        return {"instants": round(self.instants, 4), "error": round(self.error, 4), "expected": round(self.expected, 4)}
+        return {key: round(value, 4) for key, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
@@ -112,8 +116,9 @@ def find_offsets(
     """Offset of each camera against the others, up to `reach` instants either way; cameras that share no motion with
     another are missing.
 
-    Most cameras are taken to be right: the offset that most have is 0. Whoever lies most surely is moved, until nobody
-    does. Of cameras whose places nobody knows, how much moves in the whole picture is compared, which tells less.
+    Most cameras are taken to be right: the offset that most have is 0. While any camera lies, the one is moved after
+    which all fit best. Of cameras whose places nobody knows, how much moves in the whole picture is compared, which
+    tells less.
 
     Args:
         seen: by camera, all of the same T instants.
@@ -131,27 +136,44 @@ def find_offsets(
         if not pairs:
             return {}
         places = _settle(pairs, _grown(pairs, len(names), reach), reach)
+    found = _measure(cameras, places, reach)
     for _ in range(len(names)):
-        found = _measure(cameras, places, reach)
-        camera = max(found, key=lambda one: _sureness(found[one]), default=None)
-        if camera is None or _sureness(found[camera]) <= 0:
+        if not any(own.lies for own in found.values()):
             break
-        places[camera] += round(found[camera].instants)
-    else:
-        found = _measure(cameras, places, reach)
+        moved, measured = _best_move(cameras, places, found, reach)
+        if _strain(measured) >= _strain(found):
+            break
+        places, found = moved, measured
     values, counts = np.unique(places, return_counts=True)
     usual = min(values[counts == counts.max()], key=abs)
+    said = expected or {}
     return {
-        names[camera]: Offset(
-            float(own.instants + places[camera] - usual), own.error, (expected or {}).get(names[camera], 0.0)
+        names[camera]: replace(
+            own, instants=float(own.instants + places[camera] - usual), expected=said.get(names[camera], 0.0)
         )
         for camera, own in found.items()
     }
 
 
-def _sureness(own: Offset) -> float:
-    """By how many errors a camera lies; 0 where it does not."""
-    return abs(own.away) / own.error if own.lies else 0.0
+def _best_move(
+    cameras: Sequence[Activity], places: np.ndarray, found: Mapping[int, Offset], reach: int
+) -> tuple[np.ndarray, dict[int, Offset]]:
+    """Places with one camera moved to where it seems to belong, and what is measured there. A camera that lies draws
+    others along: of those that seem most wrong the one is moved after which all fit best, or well enough."""
+    tried = []
+    wrong = sorted(found, key=lambda camera: -abs(found[camera].away) / found[camera].error)
+    for camera in wrong[:SUSPECTS]:
+        moved, away = places.copy(), found[camera].instants
+        moved[camera] += round(away) or int(np.sign(away))
+        tried.append((moved, _measure(cameras, moved, reach)))
+        if _strain(tried[-1][1]) <= len(found):
+            break
+    return min(tried, key=lambda one: _strain(one[1]))
+
+
+def _strain(found: Mapping[int, Offset]) -> float:
+    """How badly places fit what is measured at them."""
+    return sum((own.away / own.error) ** 2 for own in found.values())
 
 
 def _measure(cameras: Sequence[Activity], places: np.ndarray, reach: int) -> dict[int, Offset]:
@@ -160,11 +182,10 @@ def _measure(cameras: Sequence[Activity], places: np.ndarray, reach: int) -> dic
     pairs, still = compare_pairs(moved, reach), np.zeros(len(cameras), np.int64)
     found = {}
     for camera, hull in enumerate(compare_with_hull(moved, reach)):
-        parts = against_others(pairs, camera, still, reach)
-        if hull.any():
-            parts = np.concatenate([parts, HULL_WEIGHT * hull[None]])
-        if len(parts):
-            found[camera] = _locate(parts, reach)
+        kinds = [against_others(pairs, camera, still, reach), hull[None][: int(hull.any())]]
+        told = [(parts.sum(axis=0), _locate(parts, reach)) for parts in kinds if len(parts)]
+        if told:
+            found[camera] = _combined(told, reach)
     return found
 
 
@@ -232,6 +253,26 @@ def _locate(own: np.ndarray, reach: int) -> Offset:
     by_partner = [_peak(whole - partner) for partner in partners] if len(own) > 1 else []
     error = max(LEAST_ERROR, _jackknife(by_time), _jackknife(by_partner))
     return Offset(_peak(whole) - reach, error)
+
+
+def _combined(told: Sequence[tuple[np.ndarray, Offset]], reach: int) -> Offset:
+    """Mean of what barcodes and hull tell, levels [2 reach + 1, BLOCKS] and offset each, by their errors; less sure the
+    more they disagree."""
+    weights = np.array([own.error**-2 for _, own in told])
+    offsets = np.array([own.instants for _, own in told])
+    mean = float(weights @ offsets / weights.sum())
+    apart = float(weights @ (offsets - mean) ** 2) / max(1, len(told) - 1)
+    error = float(np.sqrt(max(1.0, apart) / weights.sum()))
+    whole = sum(weight * levels / levels.sum(axis=1).max() for weight, (levels, _) in zip(weights, told, strict=True))
+    return Offset(mean, error, clear=_clearness(whole, round(mean) + reach))
+
+
+def _clearness(levels: np.ndarray, top: int) -> float:
+    """By how many standard errors [n, BLOCKS] is larger at a row than two rows above and below; 0 at the edge."""
+    if not 2 <= top < len(levels) - 2:
+        return 0.0
+    gains = levels[top] - levels[[top - 2, top + 2]]
+    return float((gains.sum(axis=1) / np.maximum(np.sqrt(BLOCKS) * gains.std(axis=1, ddof=1), 1e-12)).min())
 
 
 def _peak(levels: np.ndarray) -> float:

@@ -37,7 +37,7 @@ WINDOW_SECONDS = 20.0
 class FindStarts(Stage):
     """Find when each camera began to film, by what moves or sounds: starts.json, in seconds by camera."""
 
-    name, version = "clock", 1
+    name, version = "clock", 2
     videos: Files
     timecodes: Files
     calibration: Files | None

@@ -47,6 +47,19 @@ def test_a_camera_that_is_frames_off_is_named_and_no_other(late):
         assert offsets[f"cam{number}"].instants == pytest.approx(late, abs=0.25)
 
 
+@pytest.mark.parametrize("late", [-2, 1, 5])
+def test_a_liar_among_few_draws_nobody_along(late):
+    """Of two seconds that few cameras see, who lies may remain untold, but nobody else is named."""
+    for number in range(4):
+        seen = {name: _first(own, 50) for name, own in rig(4, {number: late}).items()}
+        offsets = find_offsets(seen, REACH)
+        assert {name for name, offset in offsets.items() if offset.lies} <= {f"cam{number}"}
+
+
+def _first(own: Activity, instants: int) -> Activity:
+    return Activity(own.moving[:instants], own.there[:instants], *_place(own))
+
+
 def test_several_cameras_may_be_off_by_frames_of_their_own():
     offsets = find_offsets(rig(7, {1: 2, 4: -3}), REACH)
     assert {name: round(offset.away) for name, offset in offsets.items() if offset.lies} == {"cam1": 2, "cam4": -3}
