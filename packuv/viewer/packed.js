@@ -15,9 +15,25 @@
     index.catch(() => { index = null; }); // the next request tries again
     const place = (await index).bodies[path];
     if (!place) return plain(path, options);
-    const bytes = await part(place, options.signal);
-    return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate")));
+    try {
+      const bytes = await part(place, options.signal);
+      return await inflated(bytes, path);
+    } catch (error) {
+      if (!error.status) throw error;
+      return new Response(error.message, { status: error.status });
+    }
   };
+
+  async function inflated(bytes, path) {
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    try {
+      return new Response(await new Response(stream).arrayBuffer());
+    } catch {
+      throw refusal(`${path} is damaged`, 422);
+    }
+  }
+
+  function refusal(text, status) { return Object.assign(new Error(text), { status }); }
 
   async function open() {
     const answer = await plain("index.json");
@@ -30,7 +46,7 @@
     ranges.catch(() => { ranges = null; });
     if (!(await ranges)) return (await all(file)).slice(offset, offset + size);
     const answer = await plain(file, { signal, headers: { Range: `bytes=${offset}-${offset + size - 1}` } });
-    if (!answer.ok) throw new Error(`${file}: ${answer.status}`);
+    if (!answer.ok) throw refusal(`${file}: ${answer.status}`, answer.status);
     const bytes = await answer.arrayBuffer();
     return answer.status === 206 ? bytes : bytes.slice(offset, offset + size);
   }
@@ -54,7 +70,7 @@
   async function fetched(file) {
     try {
       const answer = await plain(file);
-      if (!answer.ok) throw new Error(`${file}: ${answer.status}`);
+      if (!answer.ok) throw refusal(`${file}: ${answer.status}`, answer.status);
       return await answer.arrayBuffer();
     } catch (error) {
       whole.delete(file); // the next request tries again

@@ -152,7 +152,9 @@ class _Handler(BaseHTTPRequestHandler):
             found = self.server.content(path)
         except Exception as error:  # a damaged file must reach the page as words, not as a dropped connection
             message = f"{path}: {error}\n".encode(errors="replace")
-            return self._send(HTTPStatus.INTERNAL_SERVER_ERROR, message, "text/plain; charset=utf-8", with_body)
+            passes = isinstance(error, OSError)  # the page asks again; what is damaged stays so
+            status = HTTPStatus.SERVICE_UNAVAILABLE if passes else HTTPStatus.INTERNAL_SERVER_ERROR
+            return self._send(status, message, "text/plain; charset=utf-8", with_body)
         if found is None:
             return self._send(HTTPStatus.NOT_FOUND, b"nothing here\n", "text/plain; charset=utf-8", with_body)
         self._send(HTTPStatus.OK, *found, with_body)

@@ -5,6 +5,7 @@ import { Navigation, frusta, worldOf } from "./navigation.js";
 
 const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
 const STALL_NOTICE_MS = 250;
+const HERE = 1, LOST = 2; // what the worker says of a frame; 0 is on its way
 const GAMMA = 2.4; // a factor on light is its power of 1 / 2.4 on sRGB + 0.055
 
 const at = (id) => document.getElementById(id);
@@ -59,6 +60,12 @@ const receive = {
     Object.assign(meter, { count: message.count, moving: message.moving, sort_ms: message.sort_ms });
     dirty = true;
   },
+  lost({ count, text }) {
+    at("lost").hidden = false;
+    at("lost").textContent = `${count} of ${frameCount} frames skipped`;
+    at("lost").title = `They are damaged or missing: ${text}`;
+    document.documentElement.dataset.lost = count; // for automation
+  },
   problem({ text }) {
     buffer.trouble = text;
     notice("");
@@ -85,7 +92,8 @@ function settleRange([near, far], slowly) {
 
 // ---- playback
 
-// The playhead goes forward only onto frames that have arrived: at the end of the buffer it stands still.
+// The playhead goes forward only onto frames that have arrived: at the end of the buffer it stands still. A lost frame
+// takes its time, and the picture before it stays.
 function advance(seconds) {
   if (player.stalled && !mayResume()) return;
   if (player.stalled) { player.stalled = false; notice(""); }
@@ -157,7 +165,7 @@ function tick(now) {
   fitCanvas();
   navigation.step(now, seconds);
   if (player.playing && !scrubbing) advance(seconds);
-  if (!waiting && (stale || player.frame !== player.shown && buffer.map[player.frame])) ask();
+  if (!waiting && (stale || player.frame !== player.shown && buffer.map[player.frame] === HERE)) ask();
   if (dirty) drawPicture();
   if (now - meter.since > 1000) showSpeeds(now);
 }
@@ -203,6 +211,10 @@ function drawMarks() {
     pen.fillRect(first * step, 0, (frame - first) * step, 10);
     first = frame + 1;
   }
+  pen.fillStyle = "#ff6b6b";
+  for (let frame = 0; frame < frameCount; frame++) {
+    if (buffer.map[frame] === LOST) pen.fillRect(frame * step, 0, Math.max(1.5, step), 10);
+  }
   pen.fillStyle = "#ffffffb0";
   for (const frame of keyframes) pen.fillRect(Math.min(frame * step, marks.width - 1.5), 0, 1.5, 10);
 }
@@ -210,7 +222,7 @@ function drawMarks() {
 // ---- words
 
 function showClock() {
-  const key = keyframes.has(player.frame) ? " · keyframe" : "";
+  const key = buffer.map[player.frame] === LOST ? " · lost" : keyframes.has(player.frame) ? " · keyframe" : "";
   const seconds = (scene.times_ns[player.frame] / 1e9).toFixed(3);
   at("clock").innerHTML = `<b>${player.frame}</b> / ${frameCount - 1} · ${seconds} s${key}`;
   at("scrub").value = player.frame;

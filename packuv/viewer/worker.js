@@ -9,6 +9,7 @@ const BUDGET_BYTES = 384 * 2 ** 20;
 const KEPT_KEYS = 4;
 const BINS = 65536;
 const RETRY_MS = [300, 1000, 3000, 10000];
+const NEVER = new Set([404, 410, 416, 422, 500]); // answers that stay: what is damaged or missing; others are tried again
 
 let scene = null;
 let tables = null; // Float32Array: positions [3, 65536], then attributes [A, 256]
@@ -17,6 +18,7 @@ let owners = []; // segment of every frame
 const keys = new Map(); // segment -> Promise of a key
 const frames = new Map(); // frame -> {segment, packed, bytes}
 const fetching = new Map(); // frame -> AbortController
+const lost = new Set(); // frames that are damaged or missing; the rest plays on without them
 let playhead = { frame: 0, loops: true };
 let failures = 0;
 let resumeAt = 0; // no fetch before this time after a failure
@@ -44,9 +46,12 @@ async function open() {
 
 async function get(path, signal) {
   const answer = await fetch(path, { signal });
-  if (!answer.ok) throw new Error((await answer.text()).trim() || `${path}: ${answer.status}`);
-  return answer;
+  if (answer.ok) return answer;
+  const text = (await answer.text()).trim() || `${path}: ${answer.status}`;
+  throw NEVER.has(answer.status) ? new LostError(text) : new Error(text);
 }
+
+class LostError extends Error {}
 
 // ---- fetching
 
@@ -75,7 +80,7 @@ function prefetch() {
   if (performance.now() < resumeAt) return;
   for (const frame of wanted) {
     if (fetching.size >= FETCHES) break;
-    if (!frames.has(frame) && !fetching.has(frame)) load(frame);
+    if (!frames.has(frame) && !fetching.has(frame) && !lost.has(frame)) load(frame);
   }
 }
 
@@ -91,7 +96,8 @@ async function load(frame) {
     if (failures) postMessage({ type: "problem", text: "" });
     failures = 0;
   } catch (error) {
-    if (!control.signal.aborted) fail(error);
+    if (error instanceof LostError) lose([frame], error);
+    else if (!control.signal.aborted) fail(error);
   } finally {
     fetching.delete(frame);
     prefetch();
@@ -104,6 +110,12 @@ function fail(error) {
   setTimeout(prefetch, pause + 1);
   const unreachable = error instanceof TypeError; // so fetch reports a connection that failed
   postMessage({ type: "problem", text: unreachable ? "The server does not answer; trying again." : error.message });
+}
+
+function lose(gone, error) {
+  for (const frame of gone) lost.add(frame);
+  postMessage({ type: "lost", count: lost.size, text: error.message });
+  reportBuffer();
 }
 
 function keep(frame, entry) {
@@ -123,6 +135,7 @@ function keep(frame, entry) {
 function reportBuffer() {
   const map = new Uint8Array(owners.length);
   for (const frame of frames.keys()) map[frame] = 1;
+  for (const frame of lost) map[frame] = 2;
   postMessage({ type: "buffered", map, ahead: ahead() }, [map.buffer]);
 }
 
@@ -131,7 +144,10 @@ function keyOf(segment) {
   if (known) { keys.delete(segment); keys.set(segment, known); return known; } // youngest last
   const bytes = get(`segments/${segment}.bin`).then((answer) => answer.arrayBuffer());
   const promise = bytes.then((body) => unpackKey(body, segment));
-  promise.catch(() => keys.delete(segment));
+  promise.catch((error) => {
+    keys.delete(segment);
+    if (error instanceof LostError) lose([...owners.keys()].filter((frame) => owners[frame] === segment), error);
+  });
   keys.set(segment, promise);
   const needed = new Set([...upcoming().map((frame) => owners[frame]), sent.segment]);
   for (const old of [...keys.keys()]) if (keys.size > KEPT_KEYS && !needed.has(old)) keys.delete(old);

@@ -370,3 +370,17 @@ def test_chromium_decodes_the_streams_bit_by_bit(browser, sites, codec):
         browser.evaluate(SUMS)
         browser.wait_for("window.sums")
         assert json.loads(browser.evaluate("window.sums")) == wanted
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranges", [True, False])
+def test_damaged_bytes_of_a_folder_cost_their_frame(browser, sites, tmp_path, ranges):
+    site = shutil.copytree(sites[WebCodec.VP9], tmp_path / "site")
+    file, offset, size = read_index(site)["bodies"]["frames/4.bin"]
+    body = bytearray((site / file).read_bytes())
+    body[offset + size // 2] ^= 0x55
+    (site / file).write_bytes(body)
+    with served(site, ranges=ranges) as (address, _):
+        browser.open(address + "#play=0&frame=3", 160, 120)
+        browser.wait_for("document.documentElement.dataset.lost == 1 && document.documentElement.dataset.frame == 3")
+        assert browser.evaluate("document.getElementById('wait').hidden")

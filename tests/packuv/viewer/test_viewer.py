@@ -477,7 +477,7 @@ def test_playback_stands_still_where_the_buffer_ends(browser: Browser) -> None:
     class Stuck(SegmentSource):
         def moving(self, frame: int) -> Codes:
             if frame >= 6:
-                raise ValueError("frame 6 will never come")
+                raise OSError("frame 6 will never come")
             return super().moving(frame)
 
     whole = make_source()
@@ -487,3 +487,30 @@ def test_playback_stands_still_where_the_buffer_ends(browser: Browser) -> None:
         time.sleep(1)  # 20 frames' time
         assert browser.evaluate("document.documentElement.dataset.frame") == "5"
         assert "will never come" in browser.evaluate("document.getElementById('wait').textContent")
+
+
+@pytest.mark.slow
+def test_what_is_damaged_is_skipped_and_counted(browser: Browser) -> None:
+    """The keyframe of frames 4 to 4, and frame 6; all others are there at once and play."""
+
+    class Damaged(SegmentSource):
+        def key(self, segment: int) -> Codes:
+            if segment == 1:
+                raise ValueError("packet 1 is damaged")
+            return super().key(segment)
+
+        def moving(self, frame: int) -> Codes:
+            if frame == 6:
+                raise ValueError("packet 3 is damaged")
+            return super().moving(frame)
+
+    whole, element = make_source(), "document.documentElement.dataset"
+    with running(Damaged(whole.parts, whole.quantizer, Fraction(20), whole.cameras)) as server:
+        browser.open(f"{server.url}#camera=cam1", 480, 360)
+        browser.evaluate("window.seen = new Set(); new MutationObserver(() => seen.add("
+                         f"{element}.frame)).observe(document.documentElement, {{ attributes: true }})")  # fmt: skip
+        browser.wait_for("seen.has('5') && seen.has('7') && seen.has('0')", seconds=8)
+        assert browser.evaluate(f"{element}.lost") == "2"
+        assert not browser.evaluate("seen.has('4') || seen.has('6')")
+        assert browser.evaluate("document.getElementById('lost').textContent") == "2 of 8 frames skipped"
+        assert browser.evaluate("document.getElementById('wait').hidden")
