@@ -16,6 +16,7 @@ from pathlib import Path
 import av
 import numpy as np
 
+from sync.ltc import Ltc, hear_ltc
 from sync.pictures import USUAL_RATE, Pictures, decode_picture, list_pictures
 from sync.timecode import NANOSECONDS, Timecodes, day_of, label_to_frame, labels_to_ns, ticks_to_ns
 from sync.tmcd import timecode_track_rate
@@ -87,9 +88,11 @@ class VideoInfo:
     size_bytes: int
     colour: ColourTags
     start_label: str | None = None
-    """SMPTE label of the first frame, where the container has one"""
+    """SMPTE label of the first frame, where the container or a sound track has one"""
     label_rate: Fraction | None = None
     """At which that label counts: its track's own, or the video's"""
+    heard_ns: np.ndarray | None = None
+    """int64 [frame_count]: times of day by the labels on a sound track, where the container has none"""
     odd_label: str | None = None
     """A label that does not exist at that rate, and so is not used"""
     rotation_deg: int = 0
@@ -148,6 +151,9 @@ def container_timecodes(info: VideoInfo) -> Timecodes:
     if info.start_label is None:
         odd = f"its container's label {info.odd_label} does not exist at {info.rate} frames per second; it is not used"
         return Timecodes(times, numbers, source=CONTAINER_TIMES, notes=(odd,) if info.odd_label else ())
+    if info.heard_ns is not None:
+        source = f"the LTC on its sound track, from {info.start_label} at {float(rate):.5g} per second"
+        return Timecodes(info.heard_ns, numbers, day_of(info.start_label, rate), source)
     times = labels_to_ns([info.start_label], rate) + (times - times[0])
     other = f"its container's label counts at {rate} per second, its video runs at {info.rate}"
     day, notes = day_of(info.start_label, rate), (other,) if rate != info.rate else ()
@@ -179,6 +185,7 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
     sides = (stream.width, stream.height)
     width, height = sides[::-1] if look.rotation_deg % 180 else sides
     label, label_rate, odd = _start_label(path, container, stream, rate)
+    heard = None if label else hear_ltc(path, pts_ns)
     return VideoInfo(
         width=width,
         height=height,
@@ -189,12 +196,19 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         duration_ns=int(pts_ns[-1] - pts_ns[0]) + gap,
         size_bytes=path.stat().st_size,
         colour=colour,
-        start_label=label,
-        label_rate=label_rate,
+        start_label=heard.label if heard else label,
+        label_rate=heard.rate if heard else label_rate,
+        heard_ns=heard.times_ns if heard else None,
         odd_label=odd,
         rotation_deg=look.rotation_deg,
-        notes=_stream_notes(path, container, stream),
+        notes=(*_stream_notes(path, container, stream), *_heard_notes(path, heard)),
     )
+
+
+def _heard_notes(path: Path, heard: Ltc | None) -> Iterator[str]:
+    if heard and heard.jumps:
+        times = "once" if heard.jumps == 1 else f"{heard.jumps} times"
+        yield f"{path.stem}: the LTC on its sound track jumps {times}; each frame has the time of the label before it"
 
 
 class _Look:
