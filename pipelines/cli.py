@@ -201,6 +201,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _adopt(
         command("adopt", "pipelines.commands.adopt:command", "make capture folders of a published data set, by links")
     )
+    _join(command("join", "pipelines.commands.join:command", "make one video of the chapters that a camera recorded"))
     _manifest(
         command("manifest", "pipelines.commands.datasets:manifest", "list the captures of a data set in a Parquet file")
     )
@@ -247,6 +248,11 @@ def _adopt(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--out", type=Path, default=None, metavar="DIR", help="captures go to DIR/<scene>/ (DATASET-captures)"
     )
+    _json(command)
+
+
+def _join(command: argparse.ArgumentParser) -> None:
+    command.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with videos/ in which chapters lie")
     _json(command)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sync.chapters import unjoined
 from sync.clock import ClockMode
 from sync.natural import natural_key
 from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
@@ -450,6 +451,7 @@ def _find_videos(folder: Path) -> tuple[Path, dict[str, Path]]:
     if not places:
         raise ValueError(f"{folder} is no capture: it must have a folder 'videos' with one file per camera")
     inside = next((place for place in places if _cameras(place)), places[0])
+    _check_joined(folder, inside)
     videos = _by_camera(inside, _cameras(inside))
     for camera in videos:
         # a line break would be lines of its own in a COLMAP model, which also reads names of cameras from paths of
@@ -460,6 +462,16 @@ def _find_videos(folder: Path) -> tuple[Path, dict[str, Path]]:
                 f"but is {camera!r}, that of a video in {inside}; rename the video"
             )
     return inside, videos
+
+
+def _check_joined(folder: Path, inside: Path) -> None:
+    """Raises ValueError where a camera has chapters, of which each would count as a camera, or for nothing."""
+    for camera, chapters in unjoined(inside):
+        names = ", ".join(path.name for _, path in sorted(chapters.items()))
+        raise ValueError(
+            f"each camera must have one video, but {camera} has what its recorder cut it into, {names}; join them: "
+            f"packuv join {folder}"
+        )
 
 
 def _cameras(inside: Path) -> list[Path]:

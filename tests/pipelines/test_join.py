@@ -1,0 +1,108 @@
+"""Chapters of recordings, joined into videos."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from packuv.progress import no_progress
+from pipelines.cli import main
+from pipelines.join import join
+from sync.capture import find_capture
+from sync.probe import probe_video
+from tests.support.needs import needs_ffmpeg
+
+pytestmark = needs_ffmpeg
+
+FRAMES = (20, 25, 7)
+
+
+def film(path: Path, first: int, frames: int, *, size: str = "64x48", label: str | None = None) -> None:
+    """A chapter with sound that ends a little after its pictures; each picture shows its number."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    seconds = frames / 25
+    subprocess.run(
+        ["ffmpeg", "-v", "error", "-y", "-f", "lavfi", "-i", f"testsrc=size={size}:rate=25:duration=60",
+         "-f", "lavfi", "-i", f"sine=440:duration={seconds + 0.03}",
+         "-vf", f"trim=start_frame={first}:end_frame={first + frames},setpts=PTS-STARTPTS",
+         "-c:v", "libx264", "-bf", "2", "-c:a", "aac", *(("-timecode", label) if label else ()), path],
+        check=True,
+    )  # fmt: skip
+
+
+def pictures(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as video:
+        return [frame.to_ndarray(format="gray") for frame in video.decode(video=0)]
+
+
+def record(place: Path, names: tuple[str, ...], **options: str) -> list[np.ndarray]:
+    """Chapters of these names; what they show, one after another."""
+    firsts = np.cumsum([0, *FRAMES[:-1]])
+    for name, first, frames in zip(names, firsts, FRAMES, strict=True):
+        film(place / name, int(first), frames, **(options if not first else {}))
+    return [picture for name in names for picture in pictures(place / name)]
+
+
+@pytest.mark.parametrize("names", [("GX010042.MP4", "GX020042.MP4", "GX030042.MP4"),
+                                   ("GOPR0042.MP4", "GP010042.MP4", "GP020042.MP4")])  # fmt: skip
+@pytest.mark.parametrize("own_folder", [True, False])
+def test_chapters_become_one_video_of_the_same_pictures(tmp_path: Path, names, own_folder) -> None:
+    inside = tmp_path / "videos"
+    shown = record(inside / "cam1" if own_folder else inside, names, label="10:00:00:05")
+    film(inside / "cam2.mp4", 0, 52)
+    with pytest.raises(ValueError, match=rf"has what its recorder cut it into, {names[0]}.*packuv join"):
+        find_capture(tmp_path)
+    (joined,) = join(tmp_path, no_progress)
+    video = inside / ("cam1.mp4" if own_folder else f"{names[1][:2]}0042.mp4")
+    assert (joined.video, joined.chapters, joined.frames) == (video, 3, sum(FRAMES))
+    info = probe_video(video)
+    assert set(np.diff(info.pts_ns).tolist()) == {40_000_000}
+    assert info.start_label == "10:00:00:05"
+    assert np.array_equal(pictures(video), shown)
+    assert sorted(path.name for path in (tmp_path / "chapters" / video.stem).iterdir()) == sorted(names)
+    assert sorted(path.name for path in inside.iterdir()) == sorted([video.name, "cam2.mp4"])
+    assert len(find_capture(tmp_path).cameras) == 2
+    assert join(tmp_path, no_progress) == []
+
+
+def test_a_joined_video_whose_chapters_were_not_put_away_yet_is_kept(tmp_path: Path) -> None:
+    inside = tmp_path / "videos" / "cam1"
+    record(inside, ("GX010042.MP4", "GX020042.MP4", "GX030042.MP4"))
+    join(tmp_path, no_progress)
+    video = tmp_path / "videos" / "cam1.mp4"
+    before = video.read_bytes()
+    (tmp_path / "chapters" / "cam1").rename(inside)
+    (joined,) = join(tmp_path, no_progress)
+    assert joined.frames == sum(FRAMES)
+    assert video.read_bytes() == before
+    assert not inside.exists()
+
+
+def test_what_does_not_go_on_is_not_joined(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    inside = tmp_path / "videos" / "cam1"
+    film(inside / "GX010042.MP4", 0, 5)
+    film(inside / "GX030042.MP4", 5, 5)
+    assert main(["join", str(tmp_path)]) == 2
+    assert "lacks number 2 of 3; copy it from the camera's card" in capsys.readouterr().err
+    film(inside / "GX020042.MP4", 5, 5, size="32x32")
+    assert main(["join", str(tmp_path)]) == 2
+    assert "GX020042.MP4 has pictures of 32x32" in capsys.readouterr().err
+    film(inside / "GX010043.MP4", 0, 5)
+    assert main(["join", str(tmp_path)]) == 2
+    assert "the chapters of one recording, but has those of 0042, 0043" in capsys.readouterr().err
+    assert sorted(path.name for path in inside.iterdir()) == [f"GX0{k}0042.MP4" for k in (1,)] + [
+        "GX010043.MP4", "GX020042.MP4", "GX030042.MP4"]  # fmt: skip
+    assert not (tmp_path / "chapters").exists()
+    assert main(["join", str(tmp_path / "nowhere")]) == 2
+
+
+def test_without_chapters_there_is_nothing_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film(tmp_path / "videos" / "GX010042.MP4", 0, 5)
+    film(tmp_path / "videos" / "GX010043.MP4", 0, 5)
+    assert main(["join", str(tmp_path)]) == 0
+    assert "no camera has chapters to join" in capsys.readouterr().out
+    assert find_capture(tmp_path).cameras == ("GX010042", "GX010043")
