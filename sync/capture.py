@@ -11,6 +11,7 @@ from decimal import Decimal
 from difflib import get_close_matches
 from fractions import Fraction
 from pathlib import Path
+from statistics import median_low
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,9 @@ RATE_OFF = 0.1
 """Share by which timecodes may run faster or slower than the container"""
 LABELS_APART = 1.5
 """Frames that a label may be off a timecode file: it counts whole ones"""
+BEGUN_APART_S, CLOCKS_SET_S = 1.5, 3600
+"""Seconds that creation_time, which counts whole ones, must lie apart to mean something, and at most, or a clock is not
+set"""
 MOST_OFFSET_S = 10**6
 """By which a camera's times may be moved: eleven days"""
 SHARED_TIMECODES = "timestamps.csv"
@@ -257,7 +261,11 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
         ValueError: some cameras have timecode files and others have not (their times would not be comparable), a file
             does not parse, or its lines do not fit the frames of the video.
     """
-    return with_offsets(capture, _told_timecodes(capture, infos))
+    told = _told_timecodes(capture, infos)
+    if not capture.timecodes:
+        begun = {name: infos[name].begun_ns for name in told if not infos[name].start_label}
+        told = {camera: codes.noting(*_begun_notes(camera, begun)) for camera, codes in told.items()}
+    return with_offsets(capture, told)
 
 
 def load_durations(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
@@ -311,6 +319,21 @@ def _rate_notes(path: Path, codes: Timecodes, video_ns: int | None) -> Iterator[
             )
     if abs(ratio - 1) > RATE_OFF:
         yield f"its timecodes are {own / 1e6:.4g} ms apart, the frames of its video {video_ns / 1e6:.4g} ms"
+
+
+def _begun_notes(camera: str, begun_ns: Mapping[str, int | None]) -> Iterator[str]:
+    """Where cameras were begun seconds apart by their own clocks, if these seem to have been set."""
+    begun = {name: when for name, when in begun_ns.items() if when is not None}
+    if camera not in begun:
+        return
+    apart_s = (begun[camera] - median_low(begun.values())) / NANOSECONDS
+    spread_s = (max(begun.values()) - min(begun.values())) / NANOSECONDS
+    if abs(apart_s) > BEGUN_APART_S and spread_s < CLOCKS_SET_S:
+        side = "after" if apart_s > 0 else "before"
+        yield (
+            f"its file was begun {abs(apart_s):.0f} s {side} those of most cameras, by its creation_time, but its "
+            "times count from its first frame; unless one trigger started all, set clock = 'content' in capture.toml"
+        )
 
 
 def _label_notes(camera: str, found: Mapping[str, Timecodes], labels: Mapping[str, Timecodes]) -> Iterator[str]:

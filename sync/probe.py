@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
 
@@ -93,6 +94,8 @@ class VideoInfo:
     """At which that label counts: its track's own, or the video's"""
     heard_ns: np.ndarray | None = None
     """int64 [frame_count]: times of day by the labels on a sound track, where the container has none"""
+    begun_ns: int | None = None
+    """When recording began, since 1970, by the camera's clock: creation_time, to a second in MP4"""
     odd_label: str | None = None
     """A label that does not exist at that rate, and so is not used"""
     rotation_deg: int = 0
@@ -199,10 +202,21 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         start_label=heard.label if heard else label,
         label_rate=heard.rate if heard else label_rate,
         heard_ns=heard.times_ns if heard else None,
+        begun_ns=_begun_ns(container.metadata.get("creation_time")),
         odd_label=odd,
         rotation_deg=look.rotation_deg,
         notes=(*_stream_notes(path, container, stream), *_heard_notes(path, heard)),
     )
+
+
+def _begun_ns(text: str | None) -> int | None:
+    """Of a creation_time that was set: unset ones are those of 1904 or 1970."""
+    try:
+        begun = datetime.fromisoformat(text or "")
+    except ValueError:
+        return None
+    begun = begun if begun.tzinfo else begun.replace(tzinfo=UTC)
+    return int(begun.timestamp() * NANOSECONDS) if begun.year > 1980 else None
 
 
 def _heard_notes(path: Path, heard: Ltc | None) -> Iterator[str]:

@@ -6,6 +6,7 @@ from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +14,15 @@ from hypothesis import strategies as st
 
 import sync.capture
 from sync.align import build_index, load_index, save_index
-from sync.capture import CaptureSettings, check_name, find_capture, find_lender, find_plate, load_timecodes
+from sync.capture import (
+    CaptureSettings,
+    check_name,
+    find_capture,
+    find_lender,
+    find_plate,
+    load_timecodes,
+    probe_capture,
+)
 from sync.clock import ClockMode
 from sync.probe import ColourTags, VideoInfo
 from sync.timecode import Timecodes
@@ -364,3 +373,32 @@ def test_a_plate_has_videos_of_some_cameras(tmp_path: Path) -> None:
 def test_docstring_examples_hold() -> None:
     assert doctest.testmod(sync.capture).failed == 0
     assert doctest.testmod(sync.capture).attempted > 0
+
+
+def test_files_that_were_begun_seconds_apart_are_named(tmp_path: Path) -> None:
+    """By creation_time, unless clocks are hours apart and so were never set."""
+    (tmp_path / "videos").mkdir()
+    times = {"a": "10:00:00", "b": "10:00:01", "c": "10:00:12", "d": "09:59:58"}
+
+    def noted(times: dict[str, str]) -> dict[str, str]:
+        for name, time in times.items():
+            with av.open(str(tmp_path / "videos" / f"{name}.mkv"), "w") as out:
+                out.metadata["creation_time"] = f"2026-11-29T{time}Z"
+                stream = out.add_stream("ffv1", rate=25)
+                stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+                for _ in range(3):
+                    out.mux(stream.encode(av.VideoFrame(32, 32, "yuv420p")))
+                out.mux(stream.encode())
+        capture = find_capture(tmp_path)
+        codes = load_timecodes(capture, probe_capture(capture))
+        return {name: " ".join(own.notes) for name, own in codes.items() if own.notes}
+
+    found = noted(times)
+    assert set(found) == {"c", "d"}
+    assert "begun 12 s after those of most cameras" in found["c"]
+    assert "begun 2 s before" in found["d"]
+    assert not noted({**times, "c": "14:00:12"})
+    (tmp_path / "timecodes").mkdir()
+    for name in times:
+        (tmp_path / "timecodes" / f"{name}.txt").write_text("0\n40000000\n80000000\n")
+    assert not noted(times)
