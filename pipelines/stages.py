@@ -149,7 +149,7 @@ class Sequence:
         find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
         options, starts = self.options, None
         if options.sync.clock is ClockMode.CONTENT:
-            starts = self._make(find_starts(self.workshop, options.motion))
+            starts = self._make(find_starts(self.workshop, options.motion, options.pictures.transfer))
         groups = self._make(synchronize(self.workshop, options.sync, starts))
         check_space(self.workshop, self.plan, self.options, groups)
         self.synchronized(groups)

@@ -59,9 +59,14 @@ class Offset:
     """By how many standard errors pictures agree better there than two instants beside"""
 
     @property
+    def by_chance(self) -> bool:
+        """Whether pictures agree there no better than they do anywhere."""
+        return self.clear < CLEAR
+
+    @property
     def decided(self) -> bool:
         """Whether a whole frame would have been noticed, or more has been."""
-        return self.lies or (self.clear >= CLEAR and self.error <= DECIDED)
+        return self.lies or (not self.by_chance and self.error <= DECIDED)
 
     @property
     def away(self) -> float:
@@ -71,7 +76,7 @@ class Offset:
     @property
     def lies(self) -> bool:
         """Whether the pictures refute the times, by a frame or more."""
-        return self.clear >= CLEAR and abs(self.away) > max(APART, SIGNIFICANCE * self.error)
+        return not self.by_chance and abs(self.away) > max(APART, SIGNIFICANCE * self.error)
 
     def to_json(self) -> dict[str, float]:
         return {key: round(value, 4) for key, value in asdict(self).items()}

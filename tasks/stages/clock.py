@@ -14,10 +14,10 @@ from calibration.importers import load_rig
 from calibration.rig import Rig
 from packuv.camera import PinholeCamera
 from packuv.files import save_json
-from packuv.footage import LensCamera, Views
+from packuv.footage import LensCamera, Transfer, Views
 from packuv.motion import MotionOptions, measure_motion
 from sync.capture import Capture, find_capture, load_durations, probe_capture
-from sync.content import APART, Activity, Offset, find_offsets
+from sync.content import Activity, Offset, find_offsets
 from sync.content.sound import Sound, hear, starts_by_sound
 from sync.probe import VideoInfo
 from tasks.artefacts.stage import Files, Notes, Stage, Work
@@ -29,6 +29,8 @@ from tasks.stages.synchronize import STARTS
 
 Starts = dict[str, tuple[float, float]]
 """When each camera began to film, and the error of that, seconds"""
+NEAREST = 0.5
+"""Frames up to which the error of a start may be for the nearest frame to be told"""
 WINDOW_SECONDS = 20.0
 """Of each video are looked at, from its middle; offsets of up to half of it are found"""
 
@@ -37,7 +39,7 @@ WINDOW_SECONDS = 20.0
 class FindStarts(Stage):
     """Find when each camera began to film, by what moves or sounds: starts.json, in seconds by camera."""
 
-    name, version = "clock", 2
+    name, version = "clock", 3
     videos: Files
     timecodes: Files
     calibration: Files | None
@@ -46,6 +48,8 @@ class FindStarts(Stage):
     """What capture.toml says"""
     timecode_column: str | None = None
     """Likewise"""
+    transfer: Transfer | None = None
+    """What the videos' code values mean"""
     options: MotionOptions
 
     def build(self, work: Work) -> Notes:
@@ -59,7 +63,7 @@ class FindStarts(Stage):
         answers = self._answers(capture, infos, frames, period_s, work)
         unsure, by, found = list(times), "", Starts()
         while unsure and (answer := next(answers, None)):
-            left = [name for name in times if name not in answer[1] or answer[1][name][1] > APART * period_s]
+            left = [name for name in times if name not in answer[1] or answer[1][name][1] > NEAREST * period_s]
             if not by or len(left) < len(unsure):
                 unsure, (by, found) = left, answer
         if unsure:
@@ -93,7 +97,7 @@ class FindStarts(Stage):
     def _activity(
         self, capture: Capture, frames: np.ndarray, lenses: list[LensCamera], work: Work, *, posed: bool
     ) -> Mapping[str, Activity]:
-        views = Views(dict(capture.videos), frames, lenses)
+        views = Views(dict(capture.videos), frames, lenses, transfer=self.transfer)
         folder = work.scratch / ("posed" if posed else "filmed")
         options, threads = self.options, work.site.threads
         cache = measure_motion(views, folder, options, workers=threads, progress=work.progress)
@@ -104,7 +108,7 @@ class FindStarts(Stage):
         }
 
 
-def find_starts(workshop: Workshop, options: MotionOptions) -> FindStarts:
+def find_starts(workshop: Workshop, options: MotionOptions, transfer: Transfer | None) -> FindStarts:
     """The stage for a capture whose cameras began at times that nobody noted."""
     capture = workshop.capture
     source = None if capture.settings.rig_from else capture.calibration  # which a take with another's rig passes over
@@ -115,6 +119,7 @@ def find_starts(workshop: Workshop, options: MotionOptions) -> FindStarts:
         calibration=files,
         fps=capture.settings.fps,
         timecode_column=capture.settings.timecode_column,
+        transfer=transfer,
         options=replace(options, keep_flow=False),
     )
 
@@ -161,4 +166,8 @@ def _heard(video: Path) -> Sound | None:
 
 
 def _starts(offsets: Mapping[str, Offset], period_s: float) -> Starts:
-    return {name: (offset.instants * period_s, offset.error * period_s) for name, offset in offsets.items()}
+    return {
+        name: (offset.instants * period_s, offset.error * period_s)
+        for name, offset in offsets.items()
+        if not offset.by_chance
+    }
