@@ -121,7 +121,7 @@ def find_offsets(
     """Offset of each camera against the others, up to `reach` instants either way; cameras that share no motion with
     another are missing.
 
-    Most cameras are taken to be right: the offset that most have is 0. While any camera lies, the one is moved after
+    Most cameras are taken to be right: their median is 0. While any camera lies, the one is moved after
     which all fit best. Of cameras whose places nobody knows, how much moves in the whole picture is compared, which
     tells less.
 
@@ -149,13 +149,36 @@ def find_offsets(
         if _strain(measured) >= _strain(found):
             break
         places, found = moved, measured
-    values, counts = np.unique(places, return_counts=True)
-    usual = min(values[counts == counts.max()], key=abs)
-    said = expected or {}
+    usual = _usual([own.instants + places[camera] for camera, own in found.items()])
+    said = [(expected or {}).get(name, 0.0) for name in names]
+    told = _told(found, places - usual, said)
+    sure = [camera for camera, own in told.items() if own.decided]
+    if len(sure) < len(told) and any(own.lies for own in told.values()):
+        again = _measure([cameras[camera] for camera in sure], places[sure], reach)
+        still = _told({sure[row]: own for row, own in again.items()}, places - usual, said)
+        told |= {camera: _doubted(own) for camera, own in told.items() if own.lies and not _lies_in(still, camera)}
+    return {names[camera]: own for camera, own in told.items()}
+
+
+def _lies_in(found: Mapping[int, Offset], camera: int) -> bool:
+    return camera in found and found[camera].lies
+
+
+def _doubted(own: Offset) -> Offset:
+    """Of a camera that lies only beside those of which nothing is told, one of which may lie in its stead."""
+    return replace(own, clear=0.0)
+
+
+def _usual(offsets: Sequence[float]) -> float:
+    """By how much most cameras are off, that is, right: the median, of two in the middle the one nearer to 0."""
+    ordered = sorted(offsets)
+    return min(ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1], key=abs, default=0.0)
+
+
+def _told(found: Mapping[int, Offset], moved: np.ndarray, said: Sequence[float]) -> dict[int, Offset]:
+    """What is measured at places, by where the cameras were."""
     return {
-        names[camera]: replace(
-            own, instants=float(own.instants + places[camera] - usual), expected=said.get(names[camera], 0.0)
-        )
+        camera: replace(own, instants=float(own.instants + moved[camera]), expected=said[camera])
         for camera, own in found.items()
     }
 

@@ -39,7 +39,7 @@ WINDOW_SECONDS = 20.0
 class FindStarts(Stage):
     """Find when each camera began to film, by what moves or sounds: starts.json, in seconds by camera."""
 
-    name, version = "clock", 3
+    name, version = "clock", 4
     videos: Files
     timecodes: Files
     calibration: Files | None

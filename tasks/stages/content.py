@@ -30,7 +30,7 @@ GRID_WIDTH = 160
 class CompareContent(Stage):
     """Measure by what moves how far each camera's pictures lie from the others' at the same instants: offsets.json."""
 
-    name, version = "content", 3
+    name, version = "content", 4
     take: Take
     """Of the cameras whose motion is measured"""
     unseen: tuple[str, ...]
