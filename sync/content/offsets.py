@@ -291,7 +291,9 @@ def _combined(told: Sequence[tuple[np.ndarray, Offset]], reach: int) -> Offset:
     mean = float(weights @ offsets / weights.sum())
     apart = float(weights @ (offsets - mean) ** 2) / max(1, len(told) - 1)
     error = float(np.sqrt(max(1.0, apart) / weights.sum()))
-    whole = sum(weight * levels / levels.sum(axis=1).max() for weight, (levels, _) in zip(weights, told, strict=True))
+    tops = [float(levels.sum(axis=1).max()) for levels, _ in told]
+    heights = [top if top > 0 else np.inf for top in tops]  # what agrees nowhere tells nothing
+    whole = sum(weight / height * levels for weight, height, (levels, _) in zip(weights, heights, told, strict=True))
     return Offset(mean, error, clear=_clearness(whole, round(mean) + reach))
 
 

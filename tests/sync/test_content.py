@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from sync.content import Activity, Content, Offset, Window, find_offsets
+from sync.content.agreement import BLOCKS
+from sync.content.offsets import _combined
 from tests.support.balls import WIDTH, camera_pose, covered, pixels_of
 
 INSTANTS, REACH = 120, 8
@@ -106,6 +108,27 @@ def test_motion_that_no_other_camera_sees_decides_nothing():
     offsets = find_offsets(seen, REACH)
     assert not any(offset.lies for offset in offsets.values())
     assert not offsets["cam0"].decided
+
+
+@pytest.mark.parametrize("share", [0.0005, 0.01, 0.5, 1.0])
+def test_whatever_moves_figures_are_finite(share):
+    rng = np.random.default_rng(7)
+    for instants in (4, 9, 17):
+        seen = {}
+        for name, own in rig(3).items():
+            moving = (rng.random((instants, own.moving.shape[1])) < share).astype(np.float32)
+            seen[name] = Activity(moving, np.arange(instants) > 0, *_place(own))
+        for offset in find_offsets(seen, REACH).values():
+            assert np.isfinite([offset.instants, offset.error, offset.clear]).all()
+
+
+def test_pictures_that_agree_nowhere_tell_nothing():
+    levels = np.zeros((2 * REACH + 1, BLOCKS))
+    for told in ([(levels, Offset(1.0, 0.1))], [(levels - 0.1, Offset(1.0, 0.1)), (levels, Offset(2.0, 0.3))]):
+        own = _combined(told, REACH)
+        assert own.clear == 0
+        assert own.by_chance
+        assert np.isfinite([own.instants, own.error]).all()
 
 
 def _place(own: Activity) -> tuple[np.ndarray | None, np.ndarray | None, int]:
