@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
@@ -15,7 +16,7 @@ from packuv.files import whole_file
 from packuv.progress import Progress
 from sync.capture import VIDEO_FOLDERS
 from sync.chapters import JOINED, unjoined
-from sync.probe import VideoInfo, probe_video
+from sync.probe import VideoInfo, container_timecodes, probe_video
 from sync.timecode import NANOSECONDS
 
 MOST = 1 << 62
@@ -51,15 +52,20 @@ def join(capture: Path, progress: Progress) -> list[Joined]:
 
 def _join(capture: Path, video: Path, chapters: dict[int, Path]) -> Joined:
     paths = _in_order(video, chapters)
+    place = capture / JOINED / video.stem
+    if taken := [path.name for path in paths if (place / path.name).exists()]:
+        raise FileExistsError(
+            f"{place / taken[0]} is in the way of the chapter of this name; take it out of the folder"
+        )
     infos = [probe_video(path) for path in paths]
     _check_alike(paths, infos)
+    _check_labels(paths, infos)
     if video.exists():  # by a run that was killed before it put the chapters away
         frames = _checked(video, paths, infos)
     else:
         with whole_file(video) as part:
             _remux(part, paths, infos)
             frames = _checked(part, paths, infos)
-    place = capture / JOINED / video.stem
     place.mkdir(parents=True, exist_ok=True)
     for path in paths:
         path.rename(place / path.name)
@@ -80,13 +86,46 @@ def _in_order(video: Path, chapters: dict[int, Path]) -> list[Path]:
 
 
 def _check_alike(paths: list[Path], infos: list[VideoInfo]) -> None:
-    first = infos[0]
-    for path, info in zip(paths, infos, strict=True):
-        if (info.codec, info.width, info.height, info.colour) != (first.codec, first.width, first.height, first.colour):
+    """Raises ValueError where a decoder, set up by the first chapter, would fail at another one."""
+    first, *others = [_coding(path, info) for path, info in zip(paths, infos, strict=True)]
+    for path, own in zip(paths[1:], others, strict=True):
+        differ = [name for name in first if own[name] != first[name] and not (name == "sound" and own[name] is None)]
+        if differ:
             raise ValueError(
-                f"chapters of one recording must be coded alike, but {path.name} has pictures of {info.width}x"
-                f"{info.height} in {info.codec}, {paths[0].name} of {first.width}x{first.height} in {first.codec}"
+                f"chapters of one recording must be coded alike, but {path.name} differs from {paths[0].name} in "
+                f"{', '.join(differ)}"
             )
+
+
+def _coding(path: Path, info: VideoInfo) -> dict[str, Any]:
+    """What chapters must have in common, by what people call it."""
+    with av.open(str(path)) as chapter:
+        codec = chapter.streams.video[0].codec_context
+        sound = next((stream.codec_context for stream in chapter.streams.audio), None)
+        return {
+            "codec": info.codec,
+            "size": (info.width, info.height),
+            "colour": info.colour,
+            "frame rate": round(float(info.rate), 1),
+            "the set-up of its codec": codec.extradata,
+            "sound": sound and (sound.name, sound.sample_rate, sound.layout.name, sound.extradata),
+        }
+
+
+def _check_labels(paths: list[Path], infos: list[VideoInfo]) -> None:
+    """Raises ValueError where a chapter's label is neither the time at which the one before ends, nor, as some cameras
+    write it, that of the first."""
+    starts = [int(container_timecodes(info).times_ns[0]) if info.start_label else None for info in infos]
+    begins = starts[0]
+    for path, info, start in zip(paths, infos, starts, strict=True):
+        if start is None or begins is None or starts[0] is None:
+            return
+        if min(abs(start - begins), abs(start - starts[0])) > NANOSECONDS:
+            raise ValueError(
+                f"chapters must go on where the one before ends, but {path.name} is labelled {info.start_label}, "
+                f"{(start - begins) / NANOSECONDS:+.1f} s from there"
+            )
+        begins += info.duration_ns
 
 
 def _remux(target: Path, paths: list[Path], infos: list[VideoInfo]) -> None:
@@ -125,10 +164,22 @@ def _moved(packet: Any, shift: Fraction) -> int | None:
 
 
 def _checked(video: Path, paths: list[Path], infos: list[VideoInfo]) -> int:
-    """Frames of the joined video, which has all of them, evenly."""
+    """Frames of the joined video. Raises ValueError unless it has the packets of all chapters, at even times."""
     whole = probe_video(video)
     steps, usual = np.diff(whole.pts_ns), np.median(np.diff(infos[0].pts_ns)) if infos[0].frame_count > 1 else 0
     seams = np.cumsum([info.frame_count for info in infos])[:-1] - 1
     if whole.frame_count != sum(info.frame_count for info in infos) or (np.abs(steps[seams] - usual) > usual / 2).any():
         raise ValueError(f"{paths[0]} and the chapters after it do not go on from one to the next; join them by hand")
+    if _content([video]) != _content(paths):
+        raise ValueError(f"{video} is not what {paths[0]} and the chapters after it make; take it out of the folder")
     return whole.frame_count
+
+
+def _content(paths: list[Path]) -> str:
+    """Digest of the packets of their pictures."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with av.open(str(path)) as video:
+            for packet in video.demux(video.streams.video[0]):
+                digest.update(bytes(packet))
+    return digest.hexdigest()

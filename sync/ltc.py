@@ -24,13 +24,17 @@ LONG_S = 16.5 / RATE
 """Between half a bit at 24 frames a second, 260 us, and a whole one at 30, 417 us"""
 LONGEST_S = 2 * LONG_S
 """Longer than any bit: silence, or something else"""
-HYSTERESIS = 0.1
-"""Of the wave's usual height, which noise does not cross"""
+WHILE = RATE // 20
+"""Samples in which a wave's middle and height are measured"""
+HYSTERESIS, QUIET = 0.1, 0.2
+"""Of the wave's height about there, which noise does not cross; and of its greatest height, below which it is silent"""
 BITS = 80
 SYNC = np.array([0, 0, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0, 1], np.uint8)
 """The last bits of a frame"""
 DROP_RATE = Fraction(30000, 1001)
 RATES = (Fraction(24000, 1001), Fraction(24), Fraction(25), DROP_RATE, Fraction(30))
+LAST_FRAME = 23
+"""Of a second at the lowest rate"""
 DROP_FLAG = 10
 FIELDS = {"hours": (48, 56, 2), "minutes": (32, 40, 3), "seconds": (16, 24, 3), "frames": (0, 8, 2)}
 """First bit of the units (four) and of the tens, and how many bits tens have; the lowest comes first"""
@@ -73,8 +77,8 @@ def hear_ltc(path: Path, pts_ns: np.ndarray) -> Ltc | None:
     track, channel = place
     heard = [decode_ltc(samples[channel], start) for start, samples in _blocks(path, track, BLOCK_S)]
     labels = _joined([found for found in heard if found])
-    rate = _rate(labels)
-    return _of_frames(labels, rate, pts_ns) if rate else None
+    rate = _rate(labels) if labels else None
+    return _of_frames(labels, rate, pts_ns) if labels and rate else None
 
 
 def _find(path: Path) -> tuple[int, int] | None:
@@ -107,7 +111,9 @@ def _blocks(path: Path, track: int, seconds: float) -> Iterator[tuple[float, np.
         yield begins + count / RATE, np.concatenate(parts, axis=1)
 
 
-def _joined(found: Sequence[_Labels]) -> _Labels:
+def _joined(found: Sequence[_Labels]) -> _Labels | None:
+    if not found:
+        return None
     begins = np.concatenate([labels.begins_s for labels in found])
     return _Labels(begins, np.concatenate([labels.fields for labels in found]), found[0].drop)
 
@@ -133,13 +139,16 @@ def decode_ltc(samples: np.ndarray, start_s: float = 0.0) -> _Labels | None:
 
 
 def _turns(samples: np.ndarray) -> np.ndarray:
-    """Where a wave crosses its middle, float64 [n], in samples; noise about the middle does not count."""
-    if not len(samples):
+    """Where a wave crosses its middle, float64 [n], in samples; what is far below the usual height does not count."""
+    whole = samples[: len(samples) // WHILE * WHILE].astype(np.float64).reshape(-1, WHILE)
+    if not len(whole):
         return np.zeros(0)
-    low, high = np.percentile(samples, (10, 90))
-    wave = samples.astype(np.float64) - (low + high) / 2
-    sure = np.flatnonzero(np.abs(wave) > HYSTERESIS * (high - low) / 2)
-    if high <= low or len(sure) < 2:
+    low, high = np.percentile(whole, (5, 95), axis=1)
+    heights = (high - low) / 2
+    wave = (whole - ((low + high) / 2)[:, None]).ravel()
+    least = HYSTERESIS * np.where(heights > QUIET * heights.max(), heights, np.inf)
+    sure = np.flatnonzero(np.abs(wave) > np.repeat(least, WHILE))
+    if len(sure) < 2:
         return np.zeros(0)
     turned = np.flatnonzero(np.diff(np.sign(wave[sure])))
     before, after = sure[turned], sure[turned + 1]
@@ -185,7 +194,8 @@ def _consistent(labels: _Labels) -> _Labels | None:
     """Without those that are not the next one's predecessor, or the last one's successor, by their digits."""
     hours, minutes, seconds, frames = labels.fields.T
     whole = (hours * 60 + minutes) * 60 + seconds
-    follows = ((np.diff(whole) == 0) & (np.diff(frames) == 1)) | ((whole[1:] - whole[:-1]) % 86400 == 1)
+    turns_over = ((whole[1:] - whole[:-1]) % 86400 == 1) & np.isin(frames[1:], (0, 2)) & (frames[:-1] >= LAST_FRAME)
+    follows = ((np.diff(whole) == 0) & (np.diff(frames) == 1)) | turns_over
     kept = _either(follows)
     if kept.sum() < FEWEST_LABELS:
         return None
@@ -211,6 +221,9 @@ def _of_frames(labels: _Labels, rate: Fraction, pts_ns: np.ndarray) -> Ltc:
     ]
     said, begins = labels_to_ns(texts, rate), np.rint(labels.begins_s * NANOSECONDS).astype(np.int64)
     late = said - begins
+    runs = np.cumsum(np.abs(np.diff(late, prepend=late[:1])) > NANOSECONDS / 2 / rate)
+    believed = np.bincount(runs)[runs] >= FEWEST_LABELS  # fewer in a row that agree are misread
+    late, begins = (late[believed], begins[believed]) if believed.any() else (late, begins)
     times = late[np.maximum(np.searchsorted(begins, pts_ns, side="right") - 1, 0)] + pts_ns
     first = round(Fraction(int(times[0])) * rate / NANOSECONDS)
     jumps = int((np.abs(np.diff(late)) > NANOSECONDS / 2 / rate).sum())

@@ -21,7 +21,9 @@ pytestmark = needs_ffmpeg
 FRAMES = (20, 25, 7)
 
 
-def film(path: Path, first: int, frames: int, *, size: str = "64x48", label: str | None = None) -> None:
+def film(
+    path: Path, first: int, frames: int, *, size: str = "64x48", label: str | None = None, flags: tuple[str, ...] = ()
+) -> None:
     """A chapter with sound that ends a little after its pictures; each picture shows its number."""
     path.parent.mkdir(parents=True, exist_ok=True)
     seconds = frames / 25
@@ -29,7 +31,7 @@ def film(path: Path, first: int, frames: int, *, size: str = "64x48", label: str
         ["ffmpeg", "-v", "error", "-y", "-f", "lavfi", "-i", f"testsrc=size={size}:rate=25:duration=60",
          "-f", "lavfi", "-i", f"sine=440:duration={seconds + 0.03}",
          "-vf", f"trim=start_frame={first}:end_frame={first + frames},setpts=PTS-STARTPTS",
-         "-c:v", "libx264", "-bf", "2", "-c:a", "aac", *(("-timecode", label) if label else ()), path],
+         "-c:v", "libx264", "-bf", "2", "-c:a", "aac", *(("-timecode", label) if label else ()), *flags, path],
         check=True,
     )  # fmt: skip
 
@@ -90,7 +92,7 @@ def test_what_does_not_go_on_is_not_joined(tmp_path: Path, capsys: pytest.Captur
     assert "lacks number 2 of 3; copy it from the camera's card" in capsys.readouterr().err
     film(inside / "GX020042.MP4", 5, 5, size="32x32")
     assert main(["join", str(tmp_path)]) == 2
-    assert "GX020042.MP4 has pictures of 32x32" in capsys.readouterr().err
+    assert "GX020042.MP4 differs from GX010042.MP4 in size" in capsys.readouterr().err
     film(inside / "GX010043.MP4", 0, 5)
     assert main(["join", str(tmp_path)]) == 2
     assert "the chapters of one recording, but has those of 0042, 0043" in capsys.readouterr().err
@@ -106,3 +108,52 @@ def test_without_chapters_there_is_nothing_to_do(tmp_path: Path, capsys: pytest.
     assert main(["join", str(tmp_path)]) == 0
     assert "no camera has chapters to join" in capsys.readouterr().out
     assert find_capture(tmp_path).cameras == ("GX010042", "GX010043")
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [(("-x264-params", "cabac=0"), "the set-up of its codec"), (("-ar", "32000"), "sound"), (("-r", "50"), "rate")],
+)
+def test_chapters_that_one_decoder_cannot_read_are_not_joined(tmp_path: Path, flags, named) -> None:
+    inside = tmp_path / "videos" / "cam1"
+    film(inside / "GX010042.MP4", 0, 20)
+    film(inside / "GX020042.MP4", 20, 20, flags=flags)
+    with pytest.raises(ValueError, match=f"GX020042.MP4 differs from GX010042.MP4 in .*{named}"):
+        join(tmp_path, no_progress)
+    assert not (tmp_path / "videos" / "cam1.mp4").exists()
+
+
+def test_sound_that_only_a_later_chapter_has_is_told(tmp_path: Path) -> None:
+    inside = tmp_path / "videos" / "cam1"
+    film(inside / "GX010042.MP4", 0, 20, flags=("-an",))
+    film(inside / "GX020042.MP4", 20, 20)
+    with pytest.raises(ValueError, match="in sound"):
+        join(tmp_path, no_progress)
+
+
+@pytest.mark.parametrize(("label", "goes_on"), [("10:00:00:20", True), ("10:00:00:00", True), ("10:00:59:00", False)])
+def test_labels_must_go_on_or_be_the_first_one_again(tmp_path: Path, label: str, goes_on: bool) -> None:
+    inside = tmp_path / "videos" / "cam1"
+    film(inside / "GX010042.MP4", 0, 20, label="10:00:00:00")
+    film(inside / "GX020042.MP4", 20, 20, label=label)
+    if goes_on:
+        assert join(tmp_path, no_progress)[0].frames == 40
+    else:
+        with pytest.raises(ValueError, match=r"is labelled 10:00:59:00, \+58\.2 s from there"):
+            join(tmp_path, no_progress)
+
+
+def test_what_is_in_the_way_is_neither_lost_nor_taken_for_ours(tmp_path: Path) -> None:
+    inside = tmp_path / "videos" / "cam1"
+    film(inside / "GX010042.MP4", 0, 20)
+    film(inside / "GX020042.MP4", 20, 20)
+    film(tmp_path / "videos" / "cam1.mp4", 5, 40)
+    with pytest.raises(ValueError, match=r"cam1\.mp4 is not what .* make"):
+        join(tmp_path, no_progress)
+    (tmp_path / "videos" / "cam1.mp4").unlink()
+    (old := tmp_path / "chapters" / "cam1" / "GX010042.MP4").parent.mkdir(parents=True)
+    old.write_bytes(b"another take")
+    with pytest.raises(FileExistsError, match="in the way"):
+        join(tmp_path, no_progress)
+    assert old.read_bytes() == b"another take"
+    assert not (tmp_path / "videos" / "cam1.mp4").exists()

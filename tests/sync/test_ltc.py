@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sync.capture import find_capture, load_timecodes, probe_capture
-from sync.ltc import DROP_RATE, RATE, RATES, decode_ltc
+from sync.ltc import DROP_RATE, RATE, RATES, _of_frames, decode_ltc
 from sync.probe import container_timecodes, probe_video
 from sync.timecode import NANOSECONDS, frame_to_label, frames_per_day, labels_to_ns
 from tests.support.ltc import wave
@@ -117,3 +117,35 @@ def test_cameras_are_matched_by_what_they_hear_and_jumps_are_told(tmp_path: Path
         "c: the LTC on its sound track jumps once; each frame has the time of the label before it",
     )
     assert times["c"].times_ns[-1] - times["c"].times_ns[0] > 30 * NANOSECONDS
+
+
+@pytest.mark.parametrize(("begins_s", "ends_s"), [(0.0, 6.0), (0.0, 11.0), (8.5, 60.0), (9.0, 70.0), (0.0, 70.0)])
+def test_labels_may_sound_for_a_part_of_the_track(begins_s: float, ends_s: float) -> None:
+    rate, whole = Fraction(25), np.zeros(70 * RATE, np.float32)
+    sound = wave(labels_from(1000, int((ends_s - begins_s) * 25), rate), rate)
+    whole[int(begins_s * RATE) :][: len(sound)] = sound
+    labels = decode_ltc(whole)
+    assert labels is not None
+    assert len(labels.begins_s) >= (ends_s - begins_s) * 25 - 3
+    assert decode_ltc(whole[: 10 * RATE]) is not None
+
+
+@needs_ffmpeg
+def test_a_look_that_finds_labels_which_a_whole_block_does_not_is_no_end(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    sound = rng.uniform(-1, 1, 3 * RATE)
+    sound[:RATE] = 0.02 * wave(labels_from(0, 25, Fraction(25)), Fraction(25))
+    assert probe_video(film(tmp_path / "cam.mov", [sound], codec="pcm_s16le")).frame_count == 90
+
+
+def test_misread_digits_are_not_believed() -> None:
+    rate = Fraction(25)
+    labels = labels_from(2500, 200, rate)
+    for first in (40, 41, 90, 91, 92):
+        labels[first] = labels[first][:7] + str((int(labels[first][7]) + 1) % 10) + labels[first][8:]
+    heard = decode_ltc(wave(labels, rate))
+    assert heard is not None
+    pts_ns = np.arange(200) * NANOSECONDS // 25
+    times = _of_frames(heard, rate, pts_ns)
+    assert np.abs(times.times_ns - labels_to_ns(labels[:1], rate)[0] - pts_ns).max() < 1_000_000
+    assert times.jumps == 0
