@@ -34,7 +34,9 @@ class FindMotion(Stage):
         views = Footage(self.take, work.site).open_views()
         cache = measure_motion(views, folder, self.options, workers=work.site.threads, progress=work.progress)
         folder.rename(work.out / MOTION)
-        return {"pictures": int((cache.previous >= 0).sum()), "moving_share": float(np.nanmean(_shares(cache)))}
+        measured = cache.previous >= 0  # nothing where there is a single instant
+        share = float(np.nanmean(_shares(cache))) if measured.any() else 0.0
+        return {"pictures": int(measured.sum()), "moving_share": share}
 
 
 @dataclass(frozen=True, kw_only=True)

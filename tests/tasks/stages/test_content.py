@@ -252,3 +252,14 @@ def test_stretches_are_those_in_which_most_moves() -> None:
     assert choose_windows(np.zeros(90), ContentOptions()) == [range(90)]
     assert choose_windows(np.zeros(410), ContentOptions()) == [range(205), range(205, 410)]
     assert find_offsets({}, 5) == {}
+
+
+def test_a_single_instant_has_no_motion(tmp_path: Path) -> None:
+    """And a share of it is no figure that a receipt could not hold."""
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    film(site.capture, {})
+    write_times(site.capture, {})
+    groups, rig = synchronized(site, tmp_path / "sync"), put(site, "rig", lambda out: calibrated().save(out / RIG))
+    take = Take(groups=groups, rig=rig, cameras=NAMES[:2], first=3, stop=4)
+    notes, _ = build_here(FindMotion(take=take, options=MOTION_OPTIONS), site, tmp_path / "motion")
+    assert notes == {"pictures": 0, "moving_share": 0.0}
