@@ -17,6 +17,7 @@ BENCHMARKS = (
     "forecast",
     "kills",
     "long",
+    "mishaps",
     "motion",
     "pareto",
     "raster",
