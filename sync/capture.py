@@ -46,6 +46,9 @@ SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
 TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10", "linear")
 """Values of `transfer` in capture.toml; what they mean is packuv's, see `packuv.footage.transfer`."""
+UPWARD = ("board", "cameras")
+"""Values of `up` in capture.toml that are no direction: the side of a board that lies on the floor, or as the cameras
+are held"""
 SIDECAR_SUFFIXES = frozenset(
     {".aac", ".csv", ".db", ".ini", ".jpeg", ".jpg", ".json", ".log", ".lrv", ".m4a", ".md", ".mp3", ".pdf", ".png"}
     | {".srt", ".thm", ".toml", ".txt", ".wav", ".xml", ".yaml", ".yml"}
@@ -85,6 +88,12 @@ class CaptureSettings:
     """Capture folder whose rig is this one's, beside this folder or absolute"""
     clean_plate: str | None = None
     """Folder with videos of the empty stage, filmed by the same rig; likewise"""
+    board: Mapping[str, Any] | None = None
+    """A board of known size that the videos show; what its keys mean is calibration's, see `calibration.board.Board`"""
+    distance: tuple[Mapping[str, Any], ...] = ()
+    """Known distances, likewise, see `calibration.scale.Distance`"""
+    up: str | tuple[float, float, float] | None = None
+    """Where up is: one of UPWARD, or a direction in the calibration's world; None leaves it open"""
 
     @classmethod
     def read(cls, path: Path) -> CaptureSettings:
@@ -148,6 +157,7 @@ def find_capture(folder: Path) -> Capture:
     timecodes = _find_timecodes(folder, videos)
     if settings.rig_from is not None and settings.calibration is not None:
         raise ValueError(f"{path}: the rig comes from rig_from or from calibration, not both; take one of them out")
+    _check_scale(path, settings)
     return Capture(
         folder=folder,
         name=_name(folder, settings),
@@ -612,6 +622,19 @@ def _check_names(path: Path, settings: CaptureSettings, videos: Mapping[str, Pat
         raise ValueError(f"{path}: {both} cannot be ignored and used as reference or held out")
 
 
+def _check_scale(path: Path, settings: CaptureSettings) -> None:
+    said = [key for key in ("board", "distance", "up") if getattr(settings, key)]
+    if said and settings.rig_from is not None:
+        raise ValueError(
+            f"{path}: {', '.join(said)} say how large a rig is, and where up is, but this one comes from rig_from; "
+            f"write them into the {SETTINGS} of that take"
+        )
+    if settings.up == "board" and settings.board is None:
+        raise ValueError(
+            f"{path}: up = 'board' needs a [board] that lies on the floor; describe it, or give up otherwise"
+        )
+
+
 def _checked(path: Path, key: str, value: Any) -> Any:
     """The value of a key in the form that `CaptureSettings` holds."""
     try:
@@ -626,6 +649,12 @@ def _checked(path: Path, key: str, value: Any) -> Any:
         raise ValueError(f"{path}: transfer must be one of {', '.join(TRANSFERS)}, but is {value!r}{close}")
     if key == "time_offset_s":
         return _checked_offsets(path, value)
+    if key == "board":
+        return _checked_tables(path, key, [value])[0]
+    if key == "distance":
+        return _checked_tables(path, key, value if isinstance(value, list) else [value])
+    if key == "up":
+        return _checked_up(path, value)
     many = key in ("tags", "held_out", "ignore")
     texts = value if many else [value]
     if not isinstance(texts, list) or not all(isinstance(text, str) and text for text in texts):
@@ -644,6 +673,28 @@ def _checked_offsets(path: Path, value: Any) -> dict[str, Decimal]:
                 f"way, but is {seconds!r}"
             )
     return {camera: Decimal(seconds) for camera, seconds in value.items()}
+
+
+def _checked_tables(path: Path, key: str, tables: list[Any]) -> tuple[dict[str, Any], ...]:
+    """With decimals as floats."""
+    if not tables or not all(isinstance(table, dict) for table in tables):
+        raise ValueError(f"{path}: {key} must be a table, but is {tables[0] if len(tables) == 1 else tables!r}")
+    return tuple(
+        {name: float(value) if isinstance(value, Decimal) else value for name, value in table.items()}
+        for table in tables
+    )
+
+
+def _checked_up(path: Path, value: Any) -> str | tuple[float, float, float]:
+    if isinstance(value, str) and value in UPWARD:
+        return value
+    numbers = value if isinstance(value, list) and len(value) == 3 else []
+    right = [isinstance(number, (int, Decimal)) and not isinstance(number, bool) for number in numbers]
+    x, y, z = map(float, numbers) if right and all(right) else (0.0, 0.0, 0.0)
+    if not 0 < x * x + y * y + z * z < float("inf"):
+        known = " or ".join(map(repr, UPWARD))
+        raise ValueError(f"{path}: up must be {known} or a direction [x, y, z] other than 0, but is {value!r}")
+    return x, y, z
 
 
 def _suggest(name: str, known: Iterable[str]) -> str:
