@@ -19,6 +19,7 @@ import numpy as np
 from sync.chapters import unjoined
 from sync.clock import ClockMode
 from sync.natural import natural_key
+from sync.offsets import MOST_OFFSET_S, find_offsets, offset_notes, read_offsets
 from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
 from sync.probe import VideoInfo, container_timecodes, probe_video
 from sync.timecode import NANOSECONDS, SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
@@ -38,8 +39,6 @@ LABELS_APART = 1.5
 BEGUN_APART_S, CLOCKS_SET_S = 1.5, 3600
 """Seconds that creation_time, which counts whole ones, must lie apart to mean something, and at most, or a clock is not
 set"""
-MOST_OFFSET_S = 10**6
-"""By which a camera's times may be moved: eleven days"""
 SHARED_TIMECODES = "timestamps.csv"
 SETTINGS = "capture.toml"
 SOLVE = "solve"
@@ -127,6 +126,8 @@ class Capture:
     calibration: Path | None
     """File or folder to import; None means that the rig must be solved"""
     settings: CaptureSettings = field(default_factory=CaptureSettings)
+    offsets: Path | None = None
+    """t_offsets.json, where there is one"""
     notes: tuple[str, ...] = field(default=(), compare=False)
     """What lies beside the videos and was passed over, one sentence each"""
 
@@ -165,6 +166,7 @@ def find_capture(folder: Path) -> Capture:
         timecodes={camera: timecodes[camera] for camera in kept if camera in timecodes},
         calibration=_find_calibration(folder, settings.calibration),
         settings=settings,
+        offsets=find_offsets(folder),
         notes=_passed_over(folder, inside, videos),
     )
 
@@ -259,13 +261,31 @@ def picture_notes(capture: Capture, infos: Mapping[str, VideoInfo]) -> tuple[str
     return tuple(notes)
 
 
-def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
+def timing_notes(capture: Capture, infos: Mapping[str, VideoInfo], clock: ClockMode) -> tuple[str, ...]:
+    """How t_offsets.json was understood, or why it was not."""
+    if capture.offsets is None:
+        return ()
+    if clock is not ClockMode.TRUSTED:
+        why = {
+            ClockMode.TRIGGERED: "by which the cameras film at the same times, whatever their clocks say",
+            ClockMode.CONTENT: "by which pictures and sound tell when each began",
+        }
+        return (f"{capture.offsets.name} is passed over for clock = '{clock}', {why[clock]}",)
+    moves = read_offsets(capture.offsets, capture.cameras)
+    period_ns = round(NANOSECONDS / median_low(info.rate for info in infos.values()))
+    return tuple(offset_notes(capture.offsets, moves, capture.cameras, period_ns))
+
+
+def load_timecodes(
+    capture: Capture, infos: Mapping[str, VideoInfo], clock: ClockMode | None = None
+) -> dict[str, Timecodes]:
     """Timecodes of every camera, numbered by the frames of its video, ready to align.
 
     They come from the timecode files, or from the containers if no camera has a file.
 
     Args:
         infos: what `probe_video` found, by camera.
+        clock: how the times are matched; None means as capture.toml says.
 
     Raises:
         ValueError: some cameras have timecode files and others have not (their times would not be comparable), a file
@@ -275,21 +295,37 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
     if not capture.timecodes:
         begun = {name: infos[name].begun_ns for name in told if not infos[name].start_label}
         told = {camera: codes.noting(*_begun_notes(camera, begun)) for camera, codes in told.items()}
-    return with_offsets(capture, told)
+    return with_offsets(capture, told, capture.settings.clock if clock is None else clock)
 
 
 def load_durations(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
-    """The same of cameras whose times tell only how long they have filmed: without what `time_offset_s` adds."""
+    """The same of cameras whose times tell only how long they have filmed: without what is added to them."""
     return _told_timecodes(capture, infos)
 
 
-def with_offsets(capture: Capture, timecodes: Mapping[str, Timecodes]) -> dict[str, Timecodes]:
-    """Timecodes with what `time_offset_s` in capture.toml adds to them."""
-    moves = capture.settings.time_offset_s
-    return {
-        camera: codes.moved(int(moves[camera] * NANOSECONDS)) if moves.get(camera) else codes
-        for camera, codes in timecodes.items()
-    }
+def with_offsets(capture: Capture, timecodes: Mapping[str, Timecodes], clock: ClockMode) -> dict[str, Timecodes]:
+    """Timecodes with what `offsets_of` adds to them; what capture.toml says is said by camera."""
+    said, read = capture.settings.time_offset_s, _read_offsets(capture, clock)
+    moved = dict(timecodes)
+    for camera, codes in timecodes.items():
+        if own := said.get(camera):
+            moved[camera] = codes.moved(int(own * NANOSECONDS))
+        if own := read.get(camera):
+            moved[camera] = moved[camera].moved(int(own * NANOSECONDS), told=False)
+    return moved
+
+
+def offsets_of(capture: Capture, clock: ClockMode) -> dict[str, Decimal]:
+    """Seconds to add to the times of cameras: `time_offset_s` of capture.toml and, where clocks are trusted,
+    t_offsets.json."""
+    said, read = dict(capture.settings.time_offset_s), _read_offsets(capture, clock)
+    return said | {camera: said.get(camera, Decimal(0)) + seconds for camera, seconds in read.items()}
+
+
+def _read_offsets(capture: Capture, clock: ClockMode) -> dict[str, Decimal]:
+    if capture.offsets is None or clock is not ClockMode.TRUSTED:
+        return {}
+    return read_offsets(capture.offsets, capture.cameras)
 
 
 def _told_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
@@ -667,7 +703,7 @@ def _checked_offsets(path: Path, value: Any) -> dict[str, Decimal]:
         raise ValueError(f"{path}: time_offset_s must be a table of seconds by camera, but is {value!r}")
     for camera, seconds in value.items():
         number = isinstance(seconds, (int, Decimal)) and not isinstance(seconds, bool)
-        if not number or not Decimal(seconds).is_finite() or abs(seconds) > MOST_OFFSET_S:
+        if not number or not Decimal(seconds).is_finite() or not -MOST_OFFSET_S <= seconds <= MOST_OFFSET_S:
             raise ValueError(
                 f"{path}: time_offset_s of {camera!r} must be a number of seconds, at most {MOST_OFFSET_S} either "
                 f"way, but is {seconds!r}"
