@@ -50,7 +50,8 @@ def show(
 ) -> dict[str, np.ndarray]:
     """What each camera films, uint8 [H, W, 3]; the print may be stretched, and only its left `part` be shown.
 
-    Cameras are pinholes. The rig's unit is a metre.
+    The rig's unit is a metre, and the board lies before every camera. What a lens does is taken from the middles of
+    pixels, and between them linearly.
     """
     width, height = extent(board)
     size = (round(width * FINE), round(height * FINE))
@@ -74,16 +75,15 @@ def _film(
     camera: Camera, sheet: np.ndarray, pose: np.ndarray, metres: np.ndarray, noise: float, rng: np.random.Generator
 ) -> np.ndarray:
     local = camera.camera_from_world @ pose
+    size = (camera.width, camera.height)
+    # rays of all pixels, then of a larger picture's, then where they meet the sheet
+    middles = np.stack(np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5), axis=-1)
+    plane = camera.plane_from_pixels(middles.reshape(-1, 2)).reshape(*middles.shape).astype(np.float32)
+    plane = cv2.resize(plane, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR)
+    spots = cv2.perspectiveTransform(plane, np.linalg.inv(local[:3][:, [0, 1, 3]] @ metres))
     faces = local[:3, 2] @ local[:3, 3] > 0  # who stands behind sees the white back
-    plane = camera.matrix @ local[:3][:, [0, 1, 3]] @ metres
-    # pixels of the camera, whose centres lie at 0.5, to pixels of the larger picture, whose centres lie at 0
-    larger = np.array([[FINER, 0, -0.5], [0, FINER, -0.5], [0, 0, 1.0]]) @ plane
-    size = (camera.width * FINER, camera.height * FINER)
-    filmed = np.full((size[1], size[0]), 90, np.uint8)
-    ahead = (np.abs(larger[2] @ [[0, sheet.shape[1]], [0, sheet.shape[0]], [1, 1]]) > 0).all() and local[2, 3] > 0.1
-    if ahead:
-        source = sheet if faces else np.full_like(sheet, 235)
-        cv2.warpPerspective(source, larger, size, dst=filmed, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_TRANSPARENT)
-    picture = cv2.resize(filmed, (camera.width, camera.height), interpolation=cv2.INTER_AREA).astype(np.float64)
+    source = sheet if faces else np.full_like(sheet, 235)
+    filmed = cv2.remap(source, spots, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=90)
+    picture = cv2.resize(filmed, size, interpolation=cv2.INTER_AREA).astype(np.float64)
     picture = picture + noise * rng.standard_normal(picture.shape)
     return np.repeat(np.clip(np.round(picture), 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
