@@ -148,7 +148,6 @@ class Sequence:
 
     def _synchronize(self) -> None:
         find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
-        known_of(self.workshop.capture)  # likewise what is wrong there
         options, starts = self.options, None
         if options.sync.clock is ClockMode.CONTENT:
             starts = self._make(find_starts(self.workshop, options.motion, options.pictures.transfer))
