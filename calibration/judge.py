@@ -217,7 +217,7 @@ def reread(rig: Rig, reading: Reading) -> Rig:
     if reading is Reading.AS_GIVEN:
         return rig
     cameras = (replace(c, camera_from_world=_reread_pose(c.camera_from_world, reading)) for c in rig.cameras)
-    return Rig(tuple(cameras), f"{rig.source}, read with {reading.value}", rig.metric)
+    return replace(rig, cameras=tuple(cameras), source=f"{rig.source}, read with {reading.value}", up=None)
 
 
 def _reread_pose(pose: np.ndarray, reading: Reading) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from calibration.scale import ScaleOptions
 from packuv.fit.options import FitOptions
 from packuv.footage import LightOptions, Transfer
 from packuv.motion import KeyframeOptions, MotionOptions, PatchOptions
@@ -29,6 +30,7 @@ class SequenceOptions:
     pictures: PictureOptions = field(default_factory=PictureOptions)
     sync: AlignOptions = field(default_factory=AlignOptions)
     rig: RigOptions = field(default_factory=RigOptions)
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
     light: LightOptions = field(default_factory=LightOptions)
     points: PointOptions = field(default_factory=PointOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)

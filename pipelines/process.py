@@ -46,6 +46,7 @@ from tasks.report.write import write_report
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import METRICS
 from tasks.stages.plan import Plan
+from tasks.stages.scale import known_of
 from tasks.stages.synchronize import read_videos
 
 PARTIAL = "scene.partial.mkv"
@@ -334,7 +335,9 @@ def find_sequence(request: RunRequest) -> Capture:
 
 
 def plan_of(request: RunRequest, capture: Capture) -> Plan:
-    """What the request means for this capture; raises ValueError for cameras that it lacks or a missing GPU."""
+    """What the request means for this capture; raises ValueError for cameras that it lacks or a missing GPU, or where
+    capture.toml says of the rig's size what cannot be."""
+    known_of(capture)
     first, stop = request.instants
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
     device, side_by_side = choose_device(request.device), jobs_at_once(request) > 1

@@ -24,7 +24,7 @@ from sync.clock import ClockMode
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig, read_names
+from tasks.stages.calibrate import FindPoints, ImportRig, SolveRig, borrow_rig, find_rig, read_names
 from tasks.stages.clock import find_starts
 from tasks.stages.content import CompareContent
 from tasks.stages.encode import Encode, Verify
@@ -41,6 +41,7 @@ from tasks.stages.footage import PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
+from tasks.stages.scale import ScaleRig, known_of
 from tasks.stages.synchronize import synchronize
 from tasks.stages.track import ChooseDatedKeyframes, ChooseKeyframes, DatePatches, FindMotion, read_patches, read_spans
 
@@ -176,10 +177,21 @@ class Sequence:
         """The rig: this take's own, or that of the lender, which makes it unless it is there."""
         groups, pictures, options = self.made.only("sync"), self.options.pictures, self.options.rig
         if self.lender is None:
-            return self._make(find_rig(self.workshop, self.plan, groups, pictures, options))
+            return self._scale(find_rig(self.workshop, self.plan, groups, pictures, options))
         self.lender.run("sync")
         lent = self.lender._place()
         return self._make(borrow_rig(self.workshop, self.plan, groups, pictures, self.lender.workshop, lent, options))
+
+    def _scale(self, placed: ImportRig | SolveRig) -> Key:
+        """The rig as it was placed or, where capture.toml knows its size or up, brought to that."""
+        known = known_of(self.workshop.capture)
+        if not known:
+            return self._make(placed)
+        rig, options = self.submit(placed).result(), self.options
+        take = replace(placed.take, rig=rig, cameras=read_names(self.workshop.path(rig)))
+        return self._make(
+            ScaleRig(take=take, first=self.plan.first, known=known, check=options.rig.check, options=options.scale)
+        )
 
     def _track(self) -> None:
         take, options = self._take("rig"), self.options

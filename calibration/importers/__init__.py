@@ -105,7 +105,8 @@ def load_rig(path: Path, names: Sequence[str] | None = None, sizes: Mapping[str,
         reading = found.format.read(found.file, videos)
     if not reading.views:
         raise ValueError(f"{found.file} holds no posed pictures{' of these videos' if sizes else ''}")
-    return Rig(tuple(cameras_by_name(reading.views, names, found.file)), str(found.file), reading.metric)
+    cameras = tuple(cameras_by_name(reading.views, names, found.file))
+    return Rig(cameras, str(found.file), reading.metric, reading.up)
 
 
 def find_calibration(path: Path) -> Found:

@@ -168,10 +168,15 @@ class Volume:
 
 
 def rig_views(
-    cameras: Sequence[Camera], *, held_out: Sequence[str], volume: Volume | None, unit: str
+    cameras: Sequence[Camera],
+    *,
+    held_out: Sequence[str],
+    volume: Volume | None,
+    unit: str,
+    up: Sequence[float] | None = None,
 ) -> tuple[Markup, Markup]:
-    """The rig from above and from the side, at one scale. Up is the mean of the cameras' own up."""
-    axes = np.stack(rig_axes(cameras))  # [3, 3]: across, away, up
+    """The rig from above and from the side, at one scale. Up is the mean of the cameras' own, unless `up` is given."""
+    axes = np.stack(rig_axes(cameras, up))  # [3, 3]: across, away, up
     spots = np.array([camera.centre for camera in cameras]) @ axes.T
     if volume:
         middle = axes @ volume.centre
@@ -186,9 +191,12 @@ def rig_views(
     return above, side
 
 
-def rig_axes(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rig_axes(
+    cameras: Sequence[Camera], known_up: Sequence[float] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit vectors, world: the rig's widest horizontal direction, the one to its left, and up; right-handed."""
     up = -np.sum([camera.camera_from_world[1, :3] for camera in cameras], axis=0)
+    up = up if known_up is None else np.asarray(known_up, dtype=np.float64)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
     centres = np.array([camera.centre for camera in cameras])
     level = centres - centres.mean(axis=0)

@@ -159,7 +159,7 @@ def _rig(report: ReportInput) -> Body:
     check, rig = report.check, report.rig
     unit = "m" if rig.metric else "units"
     volume = Volume(check.scene_centre, check.common_radius) if check else None
-    above, side = rig_views(rig.cameras, held_out=report.held_out, volume=volume, unit=unit)
+    above, side = rig_views(rig.cameras, held_out=report.held_out, volume=volume, unit=unit, up=rig.up)
     return {
         "source": rig.source,
         "unit": unit,

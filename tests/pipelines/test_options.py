@@ -43,7 +43,10 @@ def test_the_user_wins_over_the_capture_and_that_over_the_preset():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"fitt": {"iterations": 1}}, r"unknown option fitt; valid here: pictures, sync, rig, light, points, motion"),
+        (
+            {"fitt": {"iterations": 1}},
+            r"unknown option fitt; valid here: pictures, sync, rig, scale, light, points",
+        ),
         ({"fit": {"iteration": 1}}, r"unknown option fit\.iteration; valid here: photometric, .*, iterations, "),
         ({"fit": {"density": {"caps": 1}}}, r"unknown option fit\.density\.caps; valid here: "),
         ({"fit": {"iterations": "many"}}, r"fit\.iterations must be a whole number, but is 'many'"),

@@ -602,6 +602,9 @@ def test_the_rig_is_seen_from_above_and_from_the_side() -> None:
     across, away, up = rig_axes(rig.cameras)
     assert np.allclose(up, [0, 0, 1])
     assert np.allclose(np.cross(across, away), up)
+    tilted = (0.0, 0.6, 0.8)
+    assert np.allclose(rig_axes(rig.cameras, tilted)[2], tilted)
+    assert np.allclose(np.stack(rig_axes(rig.cameras, tilted)) @ np.stack(rig_axes(rig.cameras, tilted)).T, np.eye(3))
     above, side = rig_views(rig.cameras, held_out=["cam2"], volume=Volume((0, 0, 0), 1.0), unit="m")
     dots = [
         [(float(c.get("cx", 0)), float(c.get("cy", 0))) for c in svg_root(view).iter("circle") if c.get("r") == "3"]
