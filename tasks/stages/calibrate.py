@@ -14,7 +14,8 @@ from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
 from calibration.colour import BalanceOptions, ColourReport, balance, with_colours
 from calibration.held_out import balance_held_out
 from calibration.importers import find_calibration, load_rig
-from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again, mend
+from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again, matches_at, mend, refined
+from calibration.refine import SOLVED, Refinement, RefineOptions, refine
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
@@ -46,6 +47,9 @@ class RigOptions:
     """Use a given calibration although the pictures contradict it"""
     repair: bool = True
     """Mend cameras of a given calibration that the pictures doubt, where they tell how; it is said by name"""
+    refine: bool = True
+    """Adjust all cameras to all matches, where that helps matches that the adjustment did not see"""
+    refining: RefineOptions = field(default_factory=RefineOptions)
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
     """A camera without a pose is of no use: all must be placed, unless `min_registered` lets some be left out"""
     more_instants: int = 4
@@ -70,7 +74,7 @@ class PointOptions:
 class ImportRig(Stage):
     """Import the calibration of the capture and judge it by the pictures: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 4
+    name, version = "rig", 5
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -97,21 +101,32 @@ class ImportRig(Stage):
                 'calibration = "solve" into capture.toml to have it solved, or use it as it is with '
                 "--set rig.trust=true"
             )
-        if judgement.doubts:
+        last = len(footage.load_groups().times_ns) - 1
+        later = np.unique(np.linspace(self.first, last, self.options.more_instants + 1).round().astype(int))[1:]
+        doubted = bool(judgement.doubts)
+        if doubted:
             work.progress(0, 1, "comparing it with more pictures")
-            last = len(footage.load_groups().times_ns) - 1
-            later = np.unique(np.linspace(self.first, last, self.options.more_instants + 1).round().astype(int))[1:]
             judgement = look_again(judgement, map(footage.filmed, later), options=self.options.judge)
         if judgement.doubts and self.options.repair and not self.options.trust:
             work.progress(0, 1, "mending what the pictures doubt")
             judgement = mend(judgement, options=self.options.judge)
-        odd = {**_turned(judgement), **_strays(capture, source), **judgement.doubts, **judgement.mended}
+        if self.options.refine and not self.options.trust:
+            work.progress(0, 1, "refining all cameras")
+            more = () if doubted else later  # those have been looked at
+            judgement = refined(
+                judgement, map(footage.filmed, more), options=self.options.judge, refining=self.options.refining
+            )
+        moved = judgement.refined.told(self.options.refining) if judgement.refined else {}
+        odd = {**moved, **_turned(judgement), **_strays(capture, source), **judgement.doubts, **judgement.mended}
         _save_rig(judgement.rig, self.options, judgement.to_json(), work.out, odd=odd)
         held, verdict = f"{place} holds {kind}", judgement.matches.reason
-        return {"source": "import", "given": held, "reading": judgement.reading.value, "verdict": verdict}
+        notes = {"source": "import", "given": held, "reading": judgement.reading.value}
+        return {**notes, **_refined_notes(verdict, judgement.refined)}
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         yield "COLMAP", notes["given"]
+        if notes["unrefined"]:
+            yield "refining the cameras", notes["unrefined"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +184,7 @@ class BorrowRig(Stage):
 class SolveRig(Stage):
     """Solve the rig, from one instant, and from several if that fails: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 2
+    name, version = "rig", 3
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -179,7 +194,7 @@ class SolveRig(Stage):
     def build(self, work: Work) -> Notes:
         footage, options = Footage(self.take, work.site), self.options
         instants = complete_instants(footage.load_groups(), self.take.cameras, self.first)
-        rigs, problem = list[Rig](), None
+        rigs, shots, problem = list[Rig](), list[Mapping[str, np.ndarray]](), None
         for chosen in _attempts(instants, options.more_instants):
             work.progress(0, 1, f"COLMAP, {len(chosen)} instant{'s' * (len(chosen) > 1)}")
             shots = [footage.filmed(instant) for instant in chosen]
@@ -195,8 +210,33 @@ class SolveRig(Stage):
         rig = max(rigs, key=lambda solved: len(solved.cameras))
         kept = [name for name in self.take.cameras if name in rig.names]
         left = {name: LEFT_OUT for name in self.take.cameras if name not in kept}
-        _save_rig(rig.select(kept), options, {"source": rig.source}, work.out, odd=left)
-        return {"source": "COLMAP", "verdict": rig.source}
+        rig, done = rig.select(kept), None
+        if options.refine:
+            work.progress(0, 1, "refining all cameras")
+            done = self._refined(rig, shots)
+            rig = done.rig
+        moved = done.told(options.refining) if done else {}
+        evidence = {"source": rig.source, **({"refined": done.to_json()} if done else {})}
+        _save_rig(rig, options, evidence, work.out, odd={**moved, **left})
+        return {"source": "COLMAP", **_refined_notes(rig.source, done)}
+
+    def _refined(self, rig: Rig, shots: Sequence[Mapping[str, np.ndarray]]) -> Refinement:
+        """By the instants that it was solved from."""
+        placed = ({name: shot[name] for name in rig.names} for shot in shots)
+        found = [pair for pairs in matches_at(rig, placed, options=self.options.judge) for pair in pairs]
+        return refine(rig, found, options=replace(self.options.refining, adjust=SOLVED))
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        if notes["unrefined"]:
+            yield "refining the cameras", notes["unrefined"]
+
+
+def _refined_notes(verdict: str, done: Refinement | None) -> Notes:
+    """The verdict with what refining did, or why it did nothing."""
+    if done is None or done.freed:
+        told = f"; refined ({', '.join(done.freed)}): {done.reason}" if done else ""
+        return {"verdict": verdict + told, "unrefined": ""}
+    return {"verdict": verdict, "unrefined": done.reason}
 
 
 def _attempts(instants: np.ndarray, more: int) -> list[list[int]]:
