@@ -22,6 +22,8 @@ from calibration.tracks import Link, chain
 
 SOLVED = AdjustOptions(turn_deg=3.0, shift=0.1, focal=0.1, point=0.02, lens=0.1)
 """How far COLMAP may be off, which keeps principal points in the middle"""
+PLACES = ((POSE,),)
+"""Where lenses are known"""
 LEVELS = ((POSE,), (POSE, FOCAL), (POSE, FOCAL, POINT), (POSE, FOCAL, POINT, LENS))
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
 from calibration.colour import BalanceOptions, ColourReport, balance, with_colours
 from calibration.held_out import balance_held_out
-from calibration.importers import find_calibration, load_rig
+from calibration.importers import find_calibration, holds_lenses_alone, load_lenses, load_rig
 from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again, matches_at, mend, refined
-from calibration.refine import SOLVED, Refinement, RefineOptions, refine
+from calibration.refine import LEVELS, PLACES, SOLVED, Refinement, RefineOptions, refine
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
@@ -47,8 +47,9 @@ class RigOptions:
     """Use a given calibration although the pictures contradict it"""
     repair: bool = True
     """Mend cameras of a given calibration that the pictures doubt, where they tell how; it is said by name"""
-    refine: bool = True
-    """Adjust all cameras to all matches, where that helps matches that the adjustment did not see"""
+    refine: bool = False
+    """Adjust all cameras to all matches, where that helps matches that the adjustment did not see; it takes minutes. A
+    solve of cameras whose lenses are known is always refined"""
     refining: RefineOptions = field(default_factory=RefineOptions)
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
     """A camera without a pose is of no use: all must be placed, unless `min_registered` lets some be left out"""
@@ -74,7 +75,7 @@ class PointOptions:
 class ImportRig(Stage):
     """Import the calibration of the capture and judge it by the pictures: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 5
+    name, version = "rig", 4
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -125,7 +126,7 @@ class ImportRig(Stage):
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         yield "COLMAP", notes["given"]
-        if notes["unrefined"]:
+        if "unrefined" in notes:
             yield "refining the cameras", notes["unrefined"]
 
 
@@ -184,23 +185,26 @@ class BorrowRig(Stage):
 class SolveRig(Stage):
     """Solve the rig, from one instant, and from several if that fails: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 3
+    name, version = "rig", 2
     take: Take
     """All cameras, as filmed"""
     first: int
     """Instant from which on to solve"""
+    lenses: Files = field(default_factory=lambda: Files({}))
+    """A calibration of lenses alone, which are then known; else none"""
     options: RigOptions
 
     def build(self, work: Work) -> Notes:
         footage, options = Footage(self.take, work.site), self.options
         instants = complete_instants(footage.load_groups(), self.take.cameras, self.first)
+        lenses = self._load_lenses(footage, work) if self.lenses.sha256 else None
         rigs, shots, problem = list[Rig](), list[Mapping[str, np.ndarray]](), None
         for chosen in _attempts(instants, options.more_instants):
             work.progress(0, 1, f"COLMAP, {len(chosen)} instant{'s' * (len(chosen) > 1)}")
             shots = [footage.filmed(instant) for instant in chosen]
             pictures = {name: [shot[name] for shot in shots] for name in self.take.cameras}
             try:
-                rigs.append(solve_rig(pictures, options.solve, work.scratch))
+                rigs.append(solve_rig(pictures, options.solve, work.scratch, lenses=lenses))
             except ValueError as error:
                 problem = error
             if rigs and len(rigs[-1].cameras) == len(self.take.cameras):
@@ -211,7 +215,7 @@ class SolveRig(Stage):
         kept = [name for name in self.take.cameras if name in rig.names]
         left = {name: LEFT_OUT for name in self.take.cameras if name not in kept}
         rig, done = rig.select(kept), None
-        if options.refine:
+        if options.refine or lenses is not None:
             work.progress(0, 1, "refining all cameras")
             done = self._refined(rig, shots)
             rig = done.rig
@@ -220,23 +224,37 @@ class SolveRig(Stage):
         _save_rig(rig, options, evidence, work.out, odd={**moved, **left})
         return {"source": "COLMAP", **_refined_notes(rig.source, done)}
 
+    def _load_lenses(self, footage: Footage, work: Work) -> Rig:
+        capture = find_capture(work.site.capture)
+        source = capture.calibration
+        if source is None or calibration_files(source).keys() != self.lenses.sha256.keys():
+            raise FileNotFoundError(f"the calibration of {capture.folder} is another one than when the run began")
+        sizes = _sizes(footage, footage.filmed(self.first), read_videos(work.path(self.take.groups)))
+        return load_lenses(source, self.take.cameras, sizes)
+
     def _refined(self, rig: Rig, shots: Sequence[Mapping[str, np.ndarray]]) -> Refinement:
         """By the instants that it was solved from."""
         placed = ({name: shot[name] for name in rig.names} for shot in shots)
         found = [pair for pairs in matches_at(rig, placed, options=self.options.judge) for pair in pairs]
-        return refine(rig, found, options=replace(self.options.refining, adjust=SOLVED))
+        return refine(
+            rig,
+            found,
+            levels=PLACES if self.lenses.sha256 else LEVELS,
+            options=replace(self.options.refining, adjust=SOLVED),
+        )
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
-        if notes["unrefined"]:
+        if "unrefined" in notes:
             yield "refining the cameras", notes["unrefined"]
 
 
 def _refined_notes(verdict: str, done: Refinement | None) -> Notes:
     """The verdict with what refining did, or why it did nothing."""
-    if done is None or done.freed:
-        told = f"; refined ({', '.join(done.freed)}): {done.reason}" if done else ""
-        return {"verdict": verdict + told, "unrefined": ""}
-    return {"verdict": verdict, "unrefined": done.reason}
+    if done is None:
+        return {"verdict": verdict}
+    if not done.freed:
+        return {"verdict": verdict, "unrefined": done.reason}
+    return {"verdict": f"{verdict}; refined ({', '.join(done.freed)}): {done.reason}"}
 
 
 def _attempts(instants: np.ndarray, more: int) -> list[list[int]]:
@@ -257,6 +275,8 @@ def find_rig(
         return SolveRig(take=take, first=plan.first, options=replace(options, trust=False))
     find_calibration(source)  # a folder without a calibration is a mistake, which no solution may hide
     files = workshop.files(calibration_files(source), "reading calibration")
+    if holds_lenses_alone(source):
+        return SolveRig(take=take, first=plan.first, lenses=files, options=replace(options, trust=False))
     return ImportRig(take=take, first=plan.first, files=files, options=options)
 
 

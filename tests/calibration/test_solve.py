@@ -65,6 +65,18 @@ def test_a_textured_room_gives_its_cameras_back(tmp_path):
 
 
 @pytest.mark.slow
+def test_known_lenses_stay_as_they_are_and_steady_the_rig(tmp_path):
+    truth, _, pictures = filmed(6)
+    rig = solve_rig(pictures, replace(OPTIONS, shared_lens=False), tmp_path, lenses=truth)
+    assert [(c.fx, c.fy, c.cx, c.cy, c.distortion) for c in rig.cameras] == [
+        (c.fx, c.fy, c.cx, c.cy, c.distortion) for c in truth.cameras
+    ]
+    centre, turn_deg = errors(rig, truth)
+    assert centre < 0.005
+    assert turn_deg < 0.1
+
+
+@pytest.mark.slow
 def test_instants_of_a_standing_rig_count_as_one_picture_each(tmp_path):
     truth, _, pictures = filmed(6)
     shots = {c.name: [pictures[c.name], render(c, seed=3)] for c in truth.cameras}
