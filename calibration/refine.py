@@ -147,6 +147,7 @@ def refine(
     reason = f"matches that the fit does not see lie {best.after_px:.3f} px off, {best.before_px:.3f} as given"
     changes = _changes(rig, refined, best)
     pixels = (best.before_px, best.after_px)
+    refined = replace(refined, source=f"{rig.source}; refined ({', '.join(best.kinds)}): {reason}")
     return Refinement(refined, reason, best.kinds, len(sightings.views), gains, pixels, changes)
 
 

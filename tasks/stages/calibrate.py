@@ -218,10 +218,9 @@ class SolveRig(Stage):
         if options.refine or lenses is not None:
             work.progress(0, 1, "refining all cameras")
             done = self._refined(rig, shots)
-            rig = done.rig
         moved = done.told(options.refining) if done else {}
         evidence = {"source": rig.source, **({"refined": done.to_json()} if done else {})}
-        _save_rig(rig, options, evidence, work.out, odd={**moved, **left})
+        _save_rig(done.rig if done else rig, options, evidence, work.out, odd={**moved, **left})
         return {"source": "COLMAP", **_refined_notes(rig.source, done)}
 
     def _load_lenses(self, footage: Footage, work: Work) -> Rig:
@@ -254,7 +253,7 @@ def _refined_notes(verdict: str, done: Refinement | None) -> Notes:
         return {"verdict": verdict}
     if not done.freed:
         return {"verdict": verdict, "unrefined": done.reason}
-    return {"verdict": f"{verdict}; refined ({', '.join(done.freed)}): {done.reason}"}
+    return {"verdict": f"{verdict}; {done.reason}"}
 
 
 def _attempts(instants: np.ndarray, more: int) -> list[list[int]]:

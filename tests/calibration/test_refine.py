@@ -65,6 +65,7 @@ def test_poses_that_are_off_come_back(right):
     wrong = shaken(right, shift=0.005, turn_deg=0.3)
     done = refine(wrong, matches(right), levels=PLACES)
     assert done.freed == ("pose",)
+    assert done.rig.source.startswith("an arc; refined (pose): matches that the fit does not see lie 0.")
     before, after = errors(aligned(wrong, right), right), errors(aligned(done.rig, right), right)
     # 0.2 px over a focal length of 608 is 0.02 degrees; some hundred matches a camera average it down
     assert after[0] < 0.002 < before[0]
