@@ -48,8 +48,8 @@ class RigOptions:
     repair: bool = True
     """Mend cameras of a given calibration that the pictures doubt, where they tell how; it is said by name"""
     refine: bool = False
-    """Adjust all cameras to all matches, where that helps matches that the adjustment did not see; it takes minutes. A
-    solve of cameras whose lenses are known is always refined"""
+    """Adjust all cameras to all matches, where that helps matches that the adjustment did not see. A solve of
+    cameras whose lenses are known is always refined"""
     refining: RefineOptions = field(default_factory=RefineOptions)
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
     """A camera without a pose is of no use: all must be placed, unless `min_registered` lets some be left out"""
