@@ -360,21 +360,21 @@ def table(rows: Sequence[Row]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = command.parser("motion", __doc__)
-    parser.add_argument("--out", type=Path, help="write all figures as JSON")
+    parser.add_argument("--out", type=Path, help="JSON file; what it holds beside is kept")
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--size", default="640x360")
-    parser.add_argument("--crf", type=int, nargs="+", default=[18, 23, 28])
+    parser.add_argument("--crf", type=int, nargs="*", default=[18, 23, 28], help="none: no clip")
     parser.add_argument("--raft", type=Path, nargs="+", default=[], metavar="WEIGHTS", help="also RAFT with these")
     parser.add_argument("--codec", type=Path, metavar="CAPTURE", help="also motion vectors of this capture's videos")
     parser.add_argument("--lifted", type=Path, metavar="SIMULATED", help="also lifted motion of this simulated capture")
     given = parser.parse_args(arguments)
     width, height = map(int, given.size.split("x"))
     cv2.setNumThreads(1)
-    result: dict[str, list[Row]] = {}
-    for crf in given.crf:
+    result: dict[str, list[Row]] = json.loads(given.out.read_text()) if given.out and given.out.exists() else {}
+    for number, crf in enumerate(given.crf):
         clip = pairs(given.frames, width, height, crf)
-        once = {"flow": flow_rows, "forward-backward check": check_rows} if not result else {}
-        if given.raft and not result:
+        once = {"flow": flow_rows, "forward-backward check": check_rows} if not number else {}
+        if given.raft and not number:
             once["raft"] = partial(raft_rows, weights=given.raft)
         for name, rows in {**once, "masks": mask_rows}.items():
             tell(result, f"{name}, {given.size}, crf {crf}", rows(clip))
