@@ -60,7 +60,7 @@ def vector_rows(capture: Path) -> Iterator[Mapping[str, Any]]:
             "keyframes_flow": "",
             "keyframes_codec": "",
         }
-    both = [np.array(each).T for each in (flow, codec)]
+    both = [np.array(list(zip(*each, strict=False))) for each in (flow, codec)]  # as long as the shortest
     chosen = [[key.instant for key in choose_keyframes(_curve(each), KeyframeOptions())] for each in both]
     blank = dict.fromkeys(("decoding_ms", "with_vectors_ms", "motion_ms", "recall", "recall_with_uncoded"), "")
     told_of = {"correlation": _correlation(*both), "keyframes_flow": str(chosen[0]), "keyframes_codec": str(chosen[1])}
