@@ -25,7 +25,7 @@ from pipelines.folder import claim
 from pipelines.forecast import Forecast, Guess, Machine, forecast, machine_of, question_of, size_of, size_told
 from pipelines.ladder import up_to
 from pipelines.lender import lender_of
-from pipelines.options import SequenceOptions, compose
+from pipelines.options import SequenceOptions, check_raft, compose
 from pipelines.probe import remembered
 from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
@@ -265,8 +265,13 @@ def points_of(request: RunRequest, capture: Capture) -> dict[str, SequenceOption
 
 
 def options_of(request: RunRequest, capture: Capture, point: str) -> SequenceOptions:
-    """Of a run with the settings of this point of the ladder."""
-    return compose(point, capture.settings, request.settings, seed=request.seed, quality=request.quality)
+    """Of a run with the settings of this point of the ladder.
+
+    Raises OptionError, or ValueError for weights that RAFT cannot work with.
+    """
+    options = compose(point, capture.settings, request.settings, seed=request.seed, quality=request.quality)
+    check_raft(options)
+    return options
 
 
 def settle(sequence: Sequence, run: Run, engine: Engine, affordable: Affordable) -> tuple[Sequence, Run]:
@@ -315,7 +320,8 @@ def prepare(
     choice = chosen_of(request, affordable[-1]) if affordable else None
     options = options_of(request, capture, choice.point if choice else request.preset)
     plan = plan_of(request, capture)
-    options = replace(options, fit=replace(options.fit, device=plan.device))
+    device = plan.device
+    options = replace(options, fit=replace(options.fit, device=device), raft=replace(options.raft, device=device))
     folder = Path(request.out) / capture.name
     claim(folder, capture)
     originals = Originals(capture, folder / "file_digests.json")

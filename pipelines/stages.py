@@ -13,6 +13,7 @@ from pathlib import Path
 
 from packuv.fit.options import FirstOptions, NextOptions
 from packuv.lpips import lacking
+from packuv.motion import MotionBackend
 from packuv.motion.keyframes import fitting_order
 from packuv.motion.patches import epochs
 from pipelines.chain import Chain, Epoch, Submit
@@ -43,7 +44,16 @@ from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.scale import ScaleRig, known_of
 from tasks.stages.synchronize import synchronize
-from tasks.stages.track import ChooseDatedKeyframes, ChooseKeyframes, DatePatches, FindMotion, read_patches, read_spans
+from tasks.stages.track import (
+    RAFT,
+    ChooseDatedKeyframes,
+    ChooseKeyframes,
+    DatePatches,
+    FindMotion,
+    FindMotionByRaft,
+    read_patches,
+    read_spans,
+)
 
 
 @dataclass
@@ -195,12 +205,20 @@ class Sequence:
 
     def _track(self) -> None:
         take, options = self._take("rig"), self.options
-        motion = self._make(FindMotion(take=take, options=options.motion))
+        motion = self._make(self._motion(take))
         self._compare(take, motion)
         if patches := self._patches(take):
             self._make(ChooseDatedKeyframes(motion=motion, patches=patches, options=options.keyframes))
         else:
             self._make(ChooseKeyframes(motion=motion, options=options.keyframes))
+
+    def _motion(self, take: Take) -> FindMotion:
+        motion, raft = self.options.motion, self.options.raft
+        if motion.backend is not MotionBackend.RAFT or raft.weights is None:
+            return FindMotion(take=take, options=motion)
+        weights = Path(raft.weights).resolve()
+        network, unnamed = self.workshop.files({RAFT: weights}, "motion"), replace(raft, weights=None)
+        return FindMotionByRaft(take=take, options=motion, network=network, raft=unnamed, weights=str(weights))
 
     def _compare(self, take: Take, motion: Key) -> None:
         if not self.options.content.enabled:

@@ -8,7 +8,7 @@ import pytest
 
 from packuv.footage import Transfer
 from packuv.scene import TOLERANCES, Quality, Tolerance
-from pipelines.options import SequenceOptions, compose
+from pipelines.options import SequenceOptions, check_raft, compose
 from pipelines.request import PRESETS, RunRequest
 from sync.capture import CaptureSettings
 from sync.clock import ClockMode
@@ -75,3 +75,21 @@ def test_quality_sets_the_tolerance_of_the_scene_file_and_settings_win_over_it()
         RunRequest("/capture", "/out", memory_gb=-1)
     with pytest.raises(ValueError, match="quality must be one of lossless, high, medium, low, but is 'ultra'"):
         RunRequest("capture", "out", quality="ultra")
+
+
+def test_raft_is_refused_before_any_work_where_its_weights_are_not_there(tmp_path):
+    def check(**settings):
+        check_raft(compose("draft", CaptureSettings(), settings))
+
+    check()
+    with pytest.raises(ValueError, match=r"motion\.backend is raft, but raft\.weights names no file; give"):
+        check(motion={"backend": "raft"})
+    with pytest.raises(FileNotFoundError, match=r"raft\.weights: there is no file .*none\.pth"):
+        check(motion={"backend": "raft"}, raft={"weights": str(tmp_path / "none.pth")})
+    (tmp_path / "text.pth").write_text("no weights")
+    with pytest.raises(ValueError, match=r"text\.pth must be a state dict of torchvision's raft_large or raft_small"):
+        check(motion={"backend": "raft"}, raft={"weights": str(tmp_path / "text.pth")})
+    with pytest.raises(ValueError, match=r"but motion\.backend is dis; set motion\.backend=raft, too"):
+        check(raft={"weights": "some.pth"})
+    with pytest.raises(OptionError, match="at least one update"):
+        check(raft={"updates": "0"})
