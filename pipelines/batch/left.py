@@ -16,6 +16,7 @@ from tasks.artefacts.retention import RUN
 from tasks.artefacts.store import Key
 from tasks.report.facts import Choice
 from tasks.report.findings import Finding
+from tasks.report.verdict import Verdict
 from tasks.report.write import JSON_NAME, PAGE_NAME
 from tasks.stages.encode import SCENE
 
@@ -42,6 +43,7 @@ def outcome_left(folder: Path, run: Mapping[str, Any]) -> Outcome:
         figures=report["summary"],
         events=tuple(_event(stage) for stage in run["stages"]),
         findings=restore(tuple[Finding, ...], report["findings"]),
+        verdict=restore(Verdict | None, report.get("verdict")),
         choice=restore(Choice | None, report["run"]["choice"]),
     )
 

@@ -26,7 +26,8 @@ from tasks.report.facts import (
     mean_of,
     still_trend,
 )
-from tasks.report.findings import Finding, Limits, corner_light
+from tasks.report.findings import Finding, corner_light
+from tasks.report.limits import Limits
 from tasks.report.pictures import DIFFERENCE_GAIN, comparison
 from tasks.report.plots import (
     MOST_BARS,
@@ -74,7 +75,7 @@ class Section:
 
     name: str
     title: str
-    findings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     view: View = field(default_factory=dict)
     missing: str = ""
     """Why there is nothing to show"""
@@ -100,7 +101,7 @@ def sections(report: ReportInput, found: Sequence[Finding], limits: Limits) -> l
 
 
 def _section(name: str, body: Body, found: Sequence[Finding]) -> Section:
-    own = tuple(item.text for item in found if item.section == name)
+    own = tuple(item for item in found if item.section == name)
     if isinstance(body, str):
         return Section(name, SECTIONS[name], own, missing=body)
     return Section(name, SECTIONS[name], own, body)
