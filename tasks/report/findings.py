@@ -151,8 +151,8 @@ def _content_findings(report: ReportInput) -> Iterator[Finding]:
 def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
     if report.check is not None:
         cure = "Look at its pictures in the section on truth and render; solve the rig anew, or ignore the camera."
-        for camera, what in report.check.suspicious.items():
-            yield Finding("rig", f"{camera}: {what}.", cure=cure, camera=camera, many="cameras seem to stand amiss")
+        for name, what in report.check.suspicious.items():
+            yield Finding("rig", f"{name}: {what}.", cure=cure, camera=name, many="cameras seem to stand amiss")
     yield from _colour_findings(report)
     for camera in report.rig.cameras if report.rig else ():
         worst = max(camera.gains, key=lambda gain: abs(math.log(gain)))

@@ -11,6 +11,9 @@ from tasks.report.findings import Finding, Severity
 from tasks.report.limits import Limits
 from tasks.report.summary import summary
 
+WORDS = frozenset({"The", "What", "Renders", "Cure", "Take", "Remove", "Check", "Write", "Allow", "See"})
+"""With which findings that block a delivery begin, and their cures; anything else may be a name"""
+
 
 class Fitness(StrEnum):
     """What is said of a result as a whole."""
@@ -48,18 +51,7 @@ def _unfit(blocks: Sequence[Finding]) -> str:
 def _inner(sentence: str) -> str:
     """A sentence as part of another one; what may be a name keeps its capital."""
     text = sentence.rstrip(".")
-    lower = text.split(" ", 1)[0] in (
-        "The",
-        "What",
-        "Renders",
-        "Cure",
-        "Take",
-        "Remove",
-        "Check",
-        "Write",
-        "Allow",
-        "See",
-    )
+    lower = text.split(" ", 1)[0] in WORDS
     return text[:1].lower() + text[1:] if lower else text
 
 
