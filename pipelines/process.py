@@ -29,7 +29,7 @@ from pipelines.options import SequenceOptions, compose
 from pipelines.probe import remembered
 from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
-from pipelines.results import Ending, Run, collect, ending_of, run_json
+from pipelines.results import Ending, Run, collect, ending_of, remains, run_json
 from pipelines.stages import Made, Sequence
 from sync.capture import Capture, check_name, find_capture
 from tasks.artefacts.jobs import CancelledError, JobError, Jobs
@@ -378,7 +378,7 @@ def _publish(run: Run, folder: Path) -> Outcome:
         place(run.workshop.path(key) / SCENE, scene)
         (folder / PARTIAL).unlink(missing_ok=True)
     run.journal.started("report")
-    content = collect(run)
+    content = collect(remains(run))
     limits = run.options.report
     report = write_report(content, folder, limits=limits)
     run.journal.ended("report")

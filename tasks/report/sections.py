@@ -40,6 +40,7 @@ from tasks.report.plots import (
     rig_views,
     sparkline,
 )
+from tasks.report.summary import summary
 
 MANY_LINES = 6
 """With more cameras than this, only the worst and the mean are named"""
@@ -369,7 +370,7 @@ def _stages(report: ReportInput) -> Body:
     longest = max(stage.seconds for stage in ran) or 1
     shown, rest = told_apart(ran, lambda stage: (stage.outcome is StageOutcome.FAILED, stage.seconds))
     return {
-        "seconds": sum(stage.seconds for stage in ran),
+        "total": summary(report)["seconds"],
         "stages": [_stage_row(stage, longest) for stage in shown],
         "rest": [_rest_row(kind, stages) for kind, stages in rest.items()],
         "forecast": report.forecast,

@@ -363,10 +363,10 @@ def test_bad_colours_scores_files_and_stages_are_named() -> None:
         "stages: The stage 'encode' failed: the disk is full.",
         "quality: The mean of 17.3 dB is below the limit of 20 dB: the difference shows at a glance.",
         "size: The scene file does not decode to what was fitted: frame 3 differs.",
-        "colour: cam2 needs a colour gain of 0.50.",
         "quality: cam1 scores 10.8 dB, 6.5 dB below the median camera.",
         "quality: 1 of 12 frames score 3 dB or more below the median frame, the worst being frame 9 with 9.6 dB.",
         "gaussians: 80% of the Gaussians are dynamic: noise may pass for motion.",
+        "colour: cam2 needs a colour gain of 0.50.",
     ]
 
 
