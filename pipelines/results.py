@@ -19,7 +19,9 @@ import numpy as np
 
 import packuv
 from calibration.accept import RigReport
+from calibration.colour import ColourModel
 from calibration.rig import Rig
+from calibration.triangulate import SparsePoints, reprojections_px
 from packuv.footage import Light, damage_told
 from packuv.scene import open_scene
 from packuv.score import read_table
@@ -35,6 +37,7 @@ from tasks.artefacts.recipe import plain, restore
 from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
 from tasks.report.facts import (
+    CameraEvidence,
     Choice,
     Compared,
     Comparison,
@@ -49,7 +52,7 @@ from tasks.report.facts import (
     scene_figures,
 )
 from tasks.report.write import JSON_NAME, PAGE_NAME
-from tasks.stages.calibrate import CHECK
+from tasks.stages.calibrate import CHECK, COLOUR, POINTS
 from tasks.stages.content import read_content
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
@@ -280,6 +283,7 @@ def collect(run: Remains) -> ReportInput:
         rig=Rig.load(rig_folder / RIG) if rig_folder else None,
         held_out=run.held_out,
         check=_check(run),
+        evidence=_evidence(run.folder("points")),
         content=_content(run.folder("content")),
         footage=tuple(_footage_notes(run)),
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
@@ -346,6 +350,36 @@ def _check(run: Remains) -> RigReport | None:
     report = RigReport(**json.loads((folder / CHECK).read_text()))
     refused = run.store.receipt(background).notes.get(REFUSED, {}) if background else {}
     return replace(report, suspicious={**report.suspicious, **refused})
+
+
+def _evidence(folder: Path | None) -> dict[str, CameraEvidence]:
+    if folder is None or not (folder / COLOUR).is_file():
+        return {}
+    rig, points = Rig.load(folder / RIG), SparsePoints.load(folder / POINTS)
+    colour = json.loads((folder / COLOUR).read_text())
+    errors = reprojections_px(rig.select(points.cameras), points)
+    found = {}
+    for name in rig.names:
+        seen = errors[points.camera == points.cameras.index(name)] if name in points.cameras else None
+        found[name] = CameraEvidence(
+            points=colour["observations"].get(name),
+            error_px=float(np.median(seen)) if seen is not None and len(seen) else None,
+            gain=_gain_told(name, colour),
+        )
+    return found
+
+
+def _gain_told(name: str, colour: Mapping[str, Any]) -> str:
+    """Whether a camera's gain was measured, for people."""
+    held = colour["held_out"].get(name)
+    if held is None:
+        if name in colour["weak_cameras"]:
+            return f"not measured: only {colour['observations'].get(name, 0)} points"
+        return "measured with the others" if colour["model"] != str(ColourModel.NONE) else "none: it does not pay"
+    if held["spread_before"] is None:
+        return f"not measured: only {held['observations']} points"
+    told = f"{held['spread_after']:.1%} off instead of {held['spread_before']:.1%}"
+    return f"measured after the fit: {told}" if held["kept"] else f"not measured: it would be {told}"
 
 
 def _footage_notes(run: Remains) -> Iterator[str]:

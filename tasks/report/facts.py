@@ -58,6 +58,18 @@ class StageRecord:
 
 
 @dataclass(frozen=True)
+class CameraEvidence:
+    """What pictures say of a camera's pose and gain."""
+
+    points: int | None = None
+    """Triangulated points that it saw, or, held out, by which its gain was measured"""
+    error_px: float | None = None
+    """Median distance between where it saw them and where the rig puts them, pixels; None for a held-out camera"""
+    gain: str = ""
+    """Whether its gain was measured, and what by"""
+
+
+@dataclass(frozen=True)
 class LastingChange:
     """Something changes for good: from this frame on another backdrop stands behind what moves."""
 
@@ -274,6 +286,8 @@ class ReportInput:
     held_out: tuple[str, ...] = ()
     """Cameras that were never fitted"""
     check: RigReport | None = None
+    evidence: Mapping[str, CameraEvidence] = field(default_factory=dict)
+    """By camera; empty where no points were triangulated"""
     content: Content | None = None
     footage: tuple[str, ...] = ()
     """What was read of the videos and what was not, where it is not plain, and which pictures are damaged"""

@@ -186,6 +186,23 @@ def rig_views(
     return above, side
 
 
+def rig_model(cameras: Sequence[Camera], *, held_out: Sequence[str], volume: Volume | None) -> dict[str, object]:
+    """What page.js turns about: points along across, away and up of `rig_axes`, about their middle, in units of their
+    reach. Each camera has its tip and the four corners of its picture."""
+    axes = np.stack(rig_axes(cameras))
+    tips = np.array([camera.centre for camera in cameras]) @ axes.T
+    middle = axes @ volume.centre if volume else tips.mean(axis=0)
+    reach = max(float(np.linalg.norm(tips - middle, axis=1).max()), volume.radius if volume else 0, 1e-9)
+    shown = []
+    for camera, tip in zip(cameras, tips, strict=True):
+        corners = [(x, y) for x, y in ((0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height))]
+        rays = np.array([((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0) for x, y in corners])
+        ends = tip + 0.16 * reach * rays @ camera.camera_from_world[:3, :3] @ axes.T
+        points = (np.concatenate([tip[None], ends]) - middle) / reach
+        shown.append({"name": camera.name, "held": camera.name in held_out, "points": points.round(4).tolist()})
+    return {"cameras": shown, "volume": round(volume.radius / reach, 4) if volume else 0}
+
+
 def rig_axes(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit vectors, world: the rig's widest horizontal direction, the one to its left, and up; right-handed."""
     up = -np.sum([camera.camera_from_world[1, :3] for camera in cameras], axis=0)

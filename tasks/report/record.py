@@ -52,6 +52,7 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
         "sync": report.sync and report.sync.to_json(),
         "content": report.content and plain(report.content),
         "cameras": _cameras_json(report),
+        "evidence": {name: plain(own) for name, own in report.evidence.items()},
         "check": report.check and report.check.to_json(),
         "light": report.light
         and {

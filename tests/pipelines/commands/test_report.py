@@ -41,7 +41,7 @@ def test_two_runs_differ_in_what_was_set_what_came_and_what_is_found(
     assert told["fit.iterations"] == (900, 90)
     assert told["PSNR, dB"] == told["PSNR of cam1, dB"] == (25.0, 18.5)
     assert told["total time, s"] == (60.0, 6.0)
-    assert [item["b"] for item in found if item["kind"] == "finding"][0].startswith("The mean of 18.5 dB")
+    assert next(item["b"] for item in found if item["kind"] == "finding").startswith("The mean of 18.5 dB")
     one, two = (json.loads((folder / "report.json").read_text()) for folder in (a, b))
     there, back = list(differences(one, two)), list(differences(two, one))
     assert [(item.name, item.a, item.b) for item in there] == [(item.name, item.b, item.a) for item in back]
