@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -186,7 +187,7 @@ def rig_views(
     return above, side
 
 
-def rig_model(cameras: Sequence[Camera], *, held_out: Sequence[str], volume: Volume | None) -> dict[str, object]:
+def rig_model(cameras: Sequence[Camera], *, held_out: Sequence[str], volume: Volume | None) -> dict[str, Any]:
     """What page.js turns about: points along across, away and up of `rig_axes`, about their middle, in units of their
     reach. Each camera has its tip and the four corners of its picture."""
     axes = np.stack(rig_axes(cameras))

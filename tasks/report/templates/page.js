@@ -5,7 +5,7 @@ for (const image of document.querySelectorAll("img[data-blink]")) {
 }
 
 for (const figure of document.querySelectorAll("[data-rig]")) {  // parallel projection of across, away, up
-  const rig = JSON.parse(figure.dataset.rig), svg = figure.querySelector("svg"), size = 165;
+  const rig = JSON.parse(figure.dataset.rig), svg = figure.querySelector("svg"), size = 190;
   let yaw = 0.5, pitch = 0.5, held = null;
   const place = ([x, y, z]) => {
     const across = x * Math.cos(yaw) - y * Math.sin(yaw), away = x * Math.sin(yaw) + y * Math.cos(yaw);

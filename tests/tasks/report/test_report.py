@@ -23,7 +23,7 @@ from calibration.rig import Camera, Rig
 from sync.align import CameraReport, SyncReport
 from sync.clock import Clock, ClockMode, ClockState
 from tasks.artefacts.recipe import restore
-from tasks.report.facts import MAX_PSNR_DB, LastingChange
+from tasks.report.facts import MAX_PSNR_DB, CameraEvidence, LastingChange, mean_by_frame
 from tasks.report.findings import Severity
 from tasks.report.limits import LIMITS
 from tasks.report.page import SECTIONS, duration, page_text
@@ -35,6 +35,7 @@ from tasks.report.plots import (
     bar_chart,
     line_chart,
     rig_axes,
+    rig_model,
     rig_views,
     thinned,
 )
@@ -123,6 +124,7 @@ def make_report() -> ReportInput:
         rig=rig,
         held_out=HELD_OUT,
         check=check_rig(rig),
+        evidence={"cam0": CameraEvidence(210, 0.21, "measured with the others"), "cam1": CameraEvidence(gain="not")},
         light=make_light(),
         motion=MotionCurve(np.linspace(0, 2, FRAMES), (0, 7), (LastingChange(7, ("cam0", "cam2")),)),
         scores=make_scores(),
@@ -419,6 +421,23 @@ def test_limits_of_a_delivery_block_it_where_they_are_set(limit: dict[str, float
     blocking = [item for item in findings(report, replace(LIMITS, **limit)) if item.severity is Severity.BLOCKS]
     assert len(blocking) == 1
     assert blocking[0].cure
+
+
+def test_a_frame_is_not_worse_because_the_better_camera_did_not_film_it() -> None:
+    whole = [
+        FrameScore(camera, frame, level, 0.9) for camera, level in (("a", 24.0), ("b", 18.0)) for frame in range(9)
+    ]
+    part = [score for score in whole if (score.camera, score.frame) != ("a", 4)]
+    assert mean_by_frame(part) == pytest.approx(mean_by_frame(whole)) == dict.fromkeys(range(9), pytest.approx(21.0))
+
+
+def test_the_model_that_turns_has_the_cameras_on_their_ring() -> None:
+    model = rig_model(make_rig(8).cameras, held_out=["cam2"], volume=Volume((0, 0, 0), 1.0))
+    tips = np.array([camera["points"][0] for camera in model["cameras"]])
+    middles = np.array([np.mean(camera["points"][1:], axis=0) for camera in model["cameras"]])
+    assert np.allclose(np.linalg.norm(tips, axis=1), 1, atol=1e-3)
+    assert (np.linalg.norm(middles, axis=1) < 0.9).all()  # they look inwards
+    assert [camera["name"] for camera in model["cameras"] if camera["held"]] == ["cam2"]
 
 
 def falling(slope_db: float, frames: int = 60) -> tuple[FrameScore, ...]:
