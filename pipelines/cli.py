@@ -223,6 +223,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _worker(command("worker", "pipelines.commands.worker:worker", "make stages here for runs with --cluster"))
     _status(command("status", "pipelines.commands.watch:status", "tell what runs, what failed and what is done"))
     _cancel(command("cancel", "pipelines.commands.watch:cancel", "end runs within seconds; they can go on later"))
+    _report(command("report", "pipelines.commands.report:command", "write the report of a run anew, or compare runs"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
     _clean(command("clean", "pipelines.commands.stores:clean", "remove from stores what no run needs, or hold a quota"))
     command("doctor", "pipelines.commands.doctor:doctor", "tell what this machine has and lacks")
@@ -542,6 +543,16 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="torchvision's AlexNet or VGG-16 weights, to measure LPIPS",
     )
+    _json(command)
+
+
+def _report(command: argparse.ArgumentParser) -> None:
+    command.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a run")
+    command.add_argument(
+        "--compare", type=Path, nargs=2, default=None, metavar=("A", "B"), help="what differs between two runs"
+    )
+    command.add_argument("--dataset", type=Path, default=None, metavar="DIR", help="all runs of an output folder")
+    _set(command, "a limit of the report, as report.psnr_db=25")
     _json(command)
 
 

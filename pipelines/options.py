@@ -20,6 +20,7 @@ from sync.capture import TRANSFERS, CaptureSettings
 from sync.clock import ClockMode
 from sync.content import ContentOptions
 from tasks.artefacts.recipe import override
+from tasks.report.limits import Limits
 from tasks.stages.calibrate import PointOptions, RigOptions
 from tasks.stages.evaluate import EvaluateOptions
 from tasks.stages.footage import PictureOptions
@@ -43,6 +44,8 @@ class SequenceOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     encode: EncodeOptions = field(default_factory=EncodeOptions)
     evaluate: EvaluateOptions = field(default_factory=EvaluateOptions)
+    report: Limits = field(default_factory=Limits)
+    """No artefact depends on these"""
 
 
 assert tuple(Quality) == QUALITIES

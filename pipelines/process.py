@@ -29,7 +29,7 @@ from pipelines.options import SequenceOptions, check_raft, compose
 from pipelines.probe import remembered
 from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
-from pipelines.results import Ending, Run, collect, ending_of, run_json
+from pipelines.results import Ending, Run, collect, ending_of, remains, run_json
 from pipelines.stages import Made, Sequence
 from sync.capture import Capture, check_name, find_capture
 from tasks.artefacts.jobs import CancelledError, JobError, Jobs
@@ -41,7 +41,8 @@ from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Maker, Workshop, make_here
 from tasks.report.facts import Choice
 from tasks.report.findings import Finding, findings
-from tasks.report.record import summary
+from tasks.report.summary import summary
+from tasks.report.verdict import Verdict, verdict
 from tasks.report.write import write_report
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import METRICS
@@ -71,7 +72,9 @@ class Outcome:
     """The report's summary: PSNR, SSIM, size, time; None where there is none"""
     events: tuple[Event, ...]
     findings: tuple[Finding, ...]
-    """What in the results a person should look at"""
+    """What in the results a person should look at, the worst first"""
+    verdict: Verdict | None = None
+    """Whether they may be delivered"""
     choice: Choice | None = None
     """Where a time or an error was asked for"""
 
@@ -88,6 +91,7 @@ class Outcome:
             "report": str(self.report),
             "summary": dict(self.figures),
             "choice": plain(self.choice),
+            "verdict": plain(self.verdict),
             "findings": [finding.text for finding in self.findings],
             "stages": [event.to_json() for event in self.events],
         }
@@ -95,6 +99,8 @@ class Outcome:
     def farewell(self) -> str:
         """The last lines of a run."""
         lines = [*_doubts(self.findings), *_quality(self.figures), f"results    {self.folder}"]
+        if self.verdict:
+            lines.insert(0, f"verdict    {self.verdict.text}")
         if self.choice:
             lines.insert(0, f"chosen     {self.choice.told}")
         if self.scene:
@@ -381,11 +387,13 @@ def _publish(run: Run, folder: Path) -> Outcome:
         place(run.workshop.path(key) / SCENE, scene)
         (folder / PARTIAL).unlink(missing_ok=True)
     run.journal.started("report")
-    content = collect(run)
-    report = write_report(content, folder)
+    content = collect(remains(run))
+    limits = run.options.report
+    report = write_report(content, folder, limits=limits)
     run.journal.ended("report")
-    events, found = tuple(run.journal.events), findings(content)
-    return Outcome(folder, scene, report.page, summary(content), events, found, content.choice)
+    events, found = tuple(run.journal.events), findings(content, limits)
+    judged = verdict(content, limits, found)
+    return Outcome(folder, scene, report.page, summary(content), events, found, judged, content.choice)
 
 
 def place(source: Path, target: Path) -> None:

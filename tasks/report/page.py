@@ -12,9 +12,11 @@ from typing import NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tasks.report.facts import SIZE_FRAMES, ReportInput
-from tasks.report.findings import LIMITS, Limits, findings
-from tasks.report.record import summary
+from tasks.report.findings import findings
+from tasks.report.limits import LIMITS, Limits
 from tasks.report.sections import SECTIONS, sections
+from tasks.report.summary import summary
+from tasks.report.verdict import verdict
 
 __all__ = ["SECTIONS", "duration", "page_text"]
 
@@ -32,6 +34,7 @@ def page_text(report: ReportInput, limits: Limits = LIMITS) -> str:
             name=report.name,
             subtitle=_subtitle(report),
             cards=_cards(report),
+            verdict=verdict(report, limits, found),
             findings=found,
             most_findings=MOST_FINDINGS,
             measured=any((report.sync, report.rig, report.scores, report.scene)),

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -189,6 +190,29 @@ def rig_views(
     ]
     above, side = (_rig_view(view, cameras, held_out, volume, unit) for view in views)
     return above, side
+
+
+def rig_model(
+    cameras: Sequence[Camera],
+    *,
+    held_out: Sequence[str],
+    volume: Volume | None,
+    up: Sequence[float] | None = None,
+) -> dict[str, Any]:
+    """What page.js turns about: points along across, away and up of `rig_axes`, about their middle, in units of their
+    reach. Each camera has its tip and the four corners of its picture."""
+    axes = np.stack(rig_axes(cameras, up))
+    tips = np.array([camera.centre for camera in cameras]) @ axes.T
+    middle = axes @ volume.centre if volume else tips.mean(axis=0)
+    reach = max(float(np.linalg.norm(tips - middle, axis=1).max()), volume.radius if volume else 0, 1e-9)
+    shown = []
+    for camera, tip in zip(cameras, tips, strict=True):
+        corners = [(x, y) for x, y in ((0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height))]
+        rays = np.array([((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0) for x, y in corners])
+        ends = tip + 0.16 * reach * rays @ camera.camera_from_world[:3, :3] @ axes.T
+        points = (np.concatenate([tip[None], ends]) - middle) / reach
+        shown.append({"name": camera.name, "held": camera.name in held_out, "points": points.round(4).tolist()})
+    return {"cameras": shown, "volume": round(volume.radius / reach, 4) if volume else 0}
 
 
 def rig_axes(

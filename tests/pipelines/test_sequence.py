@@ -123,6 +123,17 @@ def test_info_and_verify_tell_what_the_scene_is(first, capsys, tmp_path):
     assert found["span"][0] <= len(data) // 2 < found["span"][1]
 
 
+def test_a_report_written_anew_is_the_same_but_for_its_limits(first):
+    folder, keep = first[0].folder, ("report.html", "report.json")
+    before = [(folder / name).read_text() for name in keep]
+    assert main(["report", str(folder)]) == 0
+    assert [(folder / name).read_text() for name in keep] == before
+    assert main(["report", str(folder), "--set", "report.psnr_db=98"]) == 0
+    assert json.loads((folder / "report.json").read_text())["verdict"]["fitness"] == "not fit for delivery"
+    assert main(["report", str(folder)]) == 0
+    assert [(folder / name).read_text() for name in keep] == before
+
+
 def test_same_command_finds_everything_there(first, capture):
     outcome, _ = first
     before = sha256(outcome.scene)
