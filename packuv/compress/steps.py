@@ -70,11 +70,13 @@ class Steps:
         """uint16 [..., 3]"""
         away = (xyz - MIDDLE) / (self.position * multiple)
         codes: np.ndarray = np.rint(away * multiple + MIDDLE) if multiple == 1 else np.rint(away) * multiple + 32768
-        return np.clip(codes, 0, 65535).astype(np.uint16)
+        clipped: np.ndarray = np.clip(codes, 0, 65535).astype(np.uint16)
+        return clipped
 
     def _attributes(self, attributes: np.ndarray) -> np.ndarray:
         """uint8 [..., A]; who is there stays there."""
-        codes = np.rint(attributes / self.attribute)
+        codes: np.ndarray = np.rint(attributes / self.attribute)
         there = attributes[..., OPACITY] > 0
         codes[..., OPACITY] = np.where(there, np.maximum(codes[..., OPACITY], 1), 0)
-        return codes.astype(np.uint8)
+        rounded: np.ndarray = codes.astype(np.uint8)
+        return rounded
