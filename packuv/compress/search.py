@@ -78,7 +78,7 @@ class Compressed:
     psnr_held_out_db: float | None
     """Of cameras from which no step was learned; None where no camera is held out"""
     loss_db: float
-    """What that costs against footage, by the goal's `fitted_db`"""
+    """What that costs against footage, by the goal's `fitted_db`; of held-out cameras where there are any"""
     noise: float
     """Mean squared error that each kind of code was meant to add to pictures"""
     steps: Steps
@@ -191,7 +191,8 @@ class _Work:
         self._ticks.advance()
         psnr_db = decibels(error)
         unseen_db = None if unseen is None else decibels(unseen)
-        return Compressed(self._source_bytes, size, psnr_db, unseen_db, self._goal.loss(psnr_db), noise, steps)
+        loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)
+        return Compressed(self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps)
 
     def _encode(self, path: Path, steps: Steps, header: SceneHeader) -> int:
         """Write the scene in these steps; its size in bytes."""

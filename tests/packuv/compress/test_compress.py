@@ -116,7 +116,8 @@ def test_a_goal_is_kept_and_nearly_reached(lossless, tmp_path, goal):
     found = compress(lossless, tmp_path / "small.mkv", goal)
     reached, wanted, _ = goal.told(found.ratio, found.loss_db)
     if goal.ratio is None:
-        assert 0.8 * wanted <= reached <= wanted
+        # Few Gaussians in few pictures: loss goes in jumps of up to a third, and the safe side of one is taken.
+        assert 0.6 * wanted <= reached <= wanted
     else:
         # The header says what was done, in half a kilobyte that no trial has.
         assert 0.9 * wanted <= reached <= 1.2 * wanted
