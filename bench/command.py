@@ -13,6 +13,7 @@ from pipelines.plugins import Add
 BENCHMARKS = (
     "ablation",
     "codec",
+    "compression",
     "content",
     "forecast",
     "kills",

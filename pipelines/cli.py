@@ -213,6 +213,9 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
             "verify", "pipelines.commands.scenes:verify", "check a scene file bit by bit, or the artefacts of a run"
         )
     )
+    _compress(
+        command("compress", "pipelines.commands.compress:command", "write a smaller scene file of a lossless one")
+    )
     _export(command("export", "", "write frames, cameras or the atlas of a scene for other programs"))
     _import(command("import", "pipelines.commands.exchange:import_splats", "turn splat files into a scene file"))
     _atlas(command("atlas", "pipelines.commands.exchange:atlas", "write the UV atlas of a frame as a picture"))
@@ -519,6 +522,25 @@ def _web(command: argparse.ArgumentParser) -> None:
     _scene(command)
     command.add_argument("--codec", choices=("vp9", "av1"), default="vp9", help="how the video streams are coded")
     _output(command, "DIR", "folder to write, new or empty")
+    _json(command)
+
+
+def _compress(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    goal = command.add_mutually_exclusive_group(required=True)
+    goal.add_argument("--ratio", type=float, default=None, metavar="N", help="N times smaller than the scene, at least")
+    goal.add_argument(
+        "--loss-db", type=float, default=None, metavar="DB", help="PSNR against footage that may be lost, about"
+    )
+    known = command.add_mutually_exclusive_group()
+    known.add_argument(
+        "--capture", type=Path, default=None, metavar="CAPTURE", help="score both scenes against this capture folder"
+    )
+    known.add_argument(
+        "--fitted-db", type=float, default=None, metavar="DB", help="PSNR of the scene against footage (taken for 30)"
+    )
+    _seed(command)
+    _output(command, "FILE", "scene file to write")
     _json(command)
 
 

@@ -32,6 +32,8 @@ KEY, DYNAMIC = 0, 1
 TRACK_NAMES = ("key", "dynamic")
 FLAG_NAMES = ("kept", "changed")
 """Names of the tracks' planes of flags."""
+COMPRESSION = "compression"
+"""Name of what `extra` says of a scene whose codes are coarser than those of the lossless one that it was made from"""
 LIGHT_STEPS = 100_000
 """Light is stored in steps of 1 / LIGHT_STEPS, a thousandth of a percent"""
 
