@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 from contextlib import suppress
 from dataclasses import dataclass
+from errno import EXDEV
 from fractions import Fraction
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import numpy as np
 from packuv.files import whole_file
 from packuv.progress import Progress
 from sync.capture import VIDEO_FOLDERS
-from sync.chapters import JOINED, unjoined
+from sync.chapters import put_away, recordings, unjoined
 from sync.probe import VideoInfo, container_timecodes, probe_video
 from sync.timecode import NANOSECONDS
 
@@ -46,32 +48,60 @@ def join(capture: Path, progress: Progress) -> list[Joined]:
     found, joined = list(unjoined(inside)), []
     for number, (camera, chapters) in enumerate(found):
         progress(number, len(found), camera)
-        joined.append(_join(capture, inside / f"{camera}.mp4", chapters))
+        joined.append(_join(inside / f"{camera}.mp4", chapters))
     return joined
 
 
-def _join(capture: Path, video: Path, chapters: dict[int, Path]) -> Joined:
-    paths = _in_order(video, chapters)
-    place = capture / JOINED / video.stem
-    if taken := [path.name for path in paths if (place / path.name).exists()]:
-        raise FileExistsError(
-            f"{place / taken[0]} is in the way of the chapter of this name; take it out of the folder"
-        )
+def _join(video: Path, chapters: dict[int, Path]) -> Joined:
+    place = put_away(video.parent, video.stem)
+    _check_movable(list(chapters.values()), place)
+    paths = _in_order(video, chapters | _away(place, chapters))
     infos = [probe_video(path) for path in paths]
     _check_alike(paths, infos)
     _check_labels(paths, infos)
-    if video.exists():  # by a run that was killed before it put the chapters away
-        frames = _checked(video, paths, infos)
+    if video.exists():  # by a run that was killed before all chapters were put away
+        _check_joined(video, paths, infos, _content(paths))
     else:
+        _remove_stale(video)
         with whole_file(video) as part:
-            _remux(part, paths, infos)
-            frames = _checked(part, paths, infos)
+            _check_joined(part, paths, infos, _remux(part, paths, infos))
     place.mkdir(parents=True, exist_ok=True)
-    for path in paths:
+    for path in chapters.values():
         path.rename(place / path.name)
     with suppress(OSError):  # previews may be left in it
         video.with_suffix("").rmdir()
-    return Joined(video, len(paths), frames)
+    return Joined(video, len(paths), sum(info.frame_count for info in infos))
+
+
+def _away(place: Path, chapters: dict[int, Path]) -> dict[int, Path]:
+    """Chapters of the same recording that a run put away before it was killed."""
+    (recording,) = recordings(chapters.values())
+    away = recordings(place.iterdir()).get(recording, {}) if place.is_dir() else {}
+    if both := sorted(chapters.keys() & away.keys()):
+        raise FileExistsError(
+            f"{away[both[0]]} is in the way of {chapters[both[0]]}, which is the same chapter; take one of them out"
+        )
+    return away
+
+
+def _check_movable(paths: list[Path], place: Path) -> None:
+    """Raises OSError where chapters cannot be put into a place by renaming them."""
+    there = next(folder for folder in (place, *place.parents) if folder.exists())
+    for path in paths:
+        if (place / path.name).exists():
+            raise FileExistsError(
+                f"{place / path.name} is in the way of the chapter of this name; take it out of the folder"
+            )
+        if path.lstat().st_dev != there.stat().st_dev:
+            raise OSError(
+                EXDEV, f"chapters are put into {place}, which must be on the disk of {path.parent}, but is on another"
+            )
+
+
+def _remove_stale(video: Path) -> None:
+    """What runs that were killed left of the video."""
+    for path in video.parent.glob(f".{escape(video.name)}.*.partial{video.suffix}"):
+        path.unlink()
 
 
 def _in_order(video: Path, chapters: dict[int, Path]) -> list[Path]:
@@ -128,8 +158,10 @@ def _check_labels(paths: list[Path], infos: list[VideoInfo]) -> None:
         begins += info.duration_ns
 
 
-def _remux(target: Path, paths: list[Path], infos: list[VideoInfo]) -> None:
-    """Packets one after another; each chapter begins where the frames of the one before end."""
+def _remux(target: Path, paths: list[Path], infos: list[VideoInfo]) -> str:
+    """Packets one after another; each chapter begins where the frames of the one before end. Digest of the packets of
+    the chapters' pictures."""
+    digest = hashlib.sha256()
     with av.open(str(target), "w", format="mp4") as out:
         begins, ends = Fraction(0), dict[int, int]()
         for path, info in zip(paths, infos, strict=True):
@@ -137,18 +169,24 @@ def _remux(target: Path, paths: list[Path], infos: list[VideoInfo]) -> None:
                 sources = [chapter.streams.video[0], *chapter.streams.audio[:1]]
                 if not out.streams:
                     _open_streams(out, sources, info)
+                    if begun := chapter.metadata.get("creation_time"):
+                        out.metadata["creation_time"] = begun
                 shift = begins - Fraction(int(info.pts_ns[0]), NANOSECONDS)
                 for packet in chapter.demux(sources):
                     number = sources.index(packet.stream)
+                    if number == 0:
+                        digest.update(bytes(packet))
                     dts = _moved(packet, shift)
                     if dts is not None and dts > ends.get(number, -MOST):  # sound outlasts pictures
                         ends[number], packet.stream = dts, out.streams[number]
                         out.mux(packet)
             begins += Fraction(info.duration_ns, NANOSECONDS)
+    return digest.hexdigest()
 
 
 def _open_streams(out: av.container.OutputContainer, sources: list[Any], info: VideoInfo) -> None:
     streams = [out.add_stream_from_template(source) for source in sources]
+    streams[0].codec_context.codec_tag = sources[0].codec_context.codec_tag  # Apple's players want hvc1
     if info.start_label and info.heard_ns is None:
         streams[0].metadata["timecode"] = info.start_label
 
@@ -163,16 +201,15 @@ def _moved(packet: Any, shift: Fraction) -> int | None:
     return int(packet.dts)
 
 
-def _checked(video: Path, paths: list[Path], infos: list[VideoInfo]) -> int:
-    """Frames of the joined video. Raises ValueError unless it has the packets of all chapters, at even times."""
+def _check_joined(video: Path, paths: list[Path], infos: list[VideoInfo], content: str) -> None:
+    """Raises ValueError unless the joined video has the packets of all chapters, at even times."""
     whole = probe_video(video)
     steps, usual = np.diff(whole.pts_ns), np.median(np.diff(infos[0].pts_ns)) if infos[0].frame_count > 1 else 0
     seams = np.cumsum([info.frame_count for info in infos])[:-1] - 1
     if whole.frame_count != sum(info.frame_count for info in infos) or (np.abs(steps[seams] - usual) > usual / 2).any():
         raise ValueError(f"{paths[0]} and the chapters after it do not go on from one to the next; join them by hand")
-    if _content([video]) != _content(paths):
+    if _content([video]) != content:
         raise ValueError(f"{video} is not what {paths[0]} and the chapters after it make; take it out of the folder")
-    return whole.frame_count
 
 
 def _content(paths: list[Path]) -> str:

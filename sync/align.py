@@ -28,8 +28,8 @@ JUMP_PERIODS = 10
 """A gap longer than this is a pause or a stall, counted as a jump and not as that many dropped frames."""
 HISTOGRAM_BINS = 20
 MOST_FRAMES = 2**14
-"""Frames of a camera, evenly spaced, that tell how its clock runs where nothing is corrected by it: an error of
-milliseconds averages out to microseconds"""
+"""Frames of a camera, evenly spaced, that tell how its clock runs: an error of milliseconds averages out to
+microseconds, and all frames of a longer recording would tell no pair otherwise"""
 
 
 @dataclass(frozen=True)
@@ -332,15 +332,16 @@ def choose_reference(times: Mapping[str, np.ndarray]) -> str:
     Args:
         times: by camera, int64 [n], strictly increasing.
     """
-    pool = np.concatenate(list(times.values()))
-    pool.sort()
     best, chosen = (-1, 0), ""
     for camera in sorted(times, key=lambda name: -len(times[name])):
         own = times[camera]
         if len(own) < best[0]:
             break  # it covers no more than it has, nor do those that follow
         reach = (frame_period(own) or 1) // 2
-        covered = int((_frames_within(pool, own, reach) * 2 >= len(times)).sum())
+        counts = np.zeros(len(own), np.int64)
+        for other in times.values():
+            counts += _frames_within(other, own, reach)
+        covered = int((counts * 2 >= len(times)).sum())
         if (covered, -len(own)) > best:
             best, chosen = (covered, -len(own)), camera
     return chosen
@@ -352,14 +353,14 @@ def frame_period(times: np.ndarray) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def _frames_within(pool: np.ndarray, times: np.ndarray, reach: int) -> np.ndarray:
-    """How many of the sorted `pool` lie in [time - reach, time + reach) for each sorted time, int64."""
+def _frames_within(other: np.ndarray, times: np.ndarray, reach: int) -> np.ndarray:
+    """How many of the sorted `other` lie in [time - reach, time + reach) for each sorted time, int64."""
     counts = np.empty(times.size, np.int64)
     first = last = 0
     for i in range(times.size):
-        while first < pool.size and pool[first] < times[i] - reach:
+        while first < other.size and other[first] < times[i] - reach:
             first += 1
-        while last < pool.size and pool[last] < times[i] + reach:
+        while last < other.size and other[last] < times[i] + reach:
             last += 1
         counts[i] = last - first
     return counts
@@ -381,10 +382,15 @@ def _tolerance(times: Mapping[str, np.ndarray], reference: str, options: AlignOp
     return period // 2
 
 
+def _some_frames(values: np.ndarray) -> np.ndarray:
+    """At most about MOST_FRAMES of them, evenly spaced."""
+    return values[:: 1 + len(values) // MOST_FRAMES]
+
+
 def _fit_clocks(times: Mapping[str, np.ndarray], reference: str) -> dict[str, Clock]:
     own = times[reference]
-    period = frame_period(own)
-    clocks = {camera: fit_clock(own, other, period) for camera, other in times.items() if camera != reference}
+    some, period = _some_frames(own), frame_period(own)
+    clocks = {camera: fit_clock(some, other, period) for camera, other in times.items() if camera != reference}
     return {**clocks, reference: Clock(ClockState.REFERENCE, int(own[0]))}
 
 
@@ -396,7 +402,7 @@ def _find_drifts(times: Mapping[str, np.ndarray], reference: str) -> dict[str, C
     """
     own, found = times[reference], dict[str, Clock]()
     period = frame_period(own)
-    some = own[:: 1 + len(own) // MOST_FRAMES]
+    some = _some_frames(own)
     for camera, other in times.items():
         span = float(other[-1] - other[0])
         if camera == reference or not period or abs(guess_drift(some, other, period)) * span < period / 8:
@@ -421,8 +427,7 @@ def _never_complete(groups: FrameGroups, times: Mapping[str, np.ndarray], tolera
 def _measure_clocks(groups: FrameGroups) -> dict[str, Clock]:
     clocks = {}
     for column, camera in enumerate(groups.cameras):
-        there = np.flatnonzero(groups.frames[:, column] >= 0)
-        there = there[:: 1 + len(there) // MOST_FRAMES]
+        there = _some_frames(np.flatnonzero(groups.frames[:, column] >= 0))
         clocks[camera] = measure_clock(groups.times_ns[there], groups.residuals_ns[there, column])
     return {**clocks, groups.reference: Clock(ClockState.REFERENCE, int(groups.times_ns[0]))}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import av
 import numpy as np
@@ -95,7 +96,7 @@ def test_what_does_not_go_on_is_not_joined(tmp_path: Path, capsys: pytest.Captur
     assert "GX020042.MP4 differs from GX010042.MP4 in size" in capsys.readouterr().err
     film(inside / "GX010043.MP4", 0, 5)
     assert main(["join", str(tmp_path)]) == 2
-    assert "the chapters of one recording, but has those of 0042, 0043" in capsys.readouterr().err
+    assert "the chapters of one recording, but has those of GX0042, GX0043" in capsys.readouterr().err
     assert sorted(path.name for path in inside.iterdir()) == [f"GX0{k}0042.MP4" for k in (1,)] + [
         "GX010043.MP4", "GX020042.MP4", "GX030042.MP4"]  # fmt: skip
     assert not (tmp_path / "chapters").exists()
@@ -157,3 +158,61 @@ def test_what_is_in_the_way_is_neither_lost_nor_taken_for_ours(tmp_path: Path) -
         join(tmp_path, no_progress)
     assert old.read_bytes() == b"another take"
     assert not (tmp_path / "videos" / "cam1.mp4").exists()
+
+
+def test_what_a_killed_run_left_is_gone_on_from(tmp_path: Path) -> None:
+    """A part of the video, and, later, chapters of which only the first is put away."""
+    inside = tmp_path / "videos"
+    names = ("GX010042.MP4", "GX020042.MP4", "GX030042.MP4")
+    shown = record(inside, names)
+    (stale := inside / ".GX0042.mp4.123-456.partial.mp4").write_bytes(b"half")
+    join(tmp_path, no_progress)
+    assert not stale.exists()
+    place, video = tmp_path / "chapters" / "GX0042", inside / "GX0042.mp4"
+    before = video.read_bytes()
+    for left in (names[1:], names[2:]):
+        for name in left:
+            (place / name).rename(inside / name)
+        with pytest.raises(ValueError, match="packuv join"):
+            find_capture(tmp_path)
+        (joined,) = join(tmp_path, no_progress)
+        assert (joined.chapters, joined.frames, video.read_bytes()) == (3, sum(FRAMES), before)
+        assert sorted(path.name for path in place.iterdir()) == sorted(names)
+        assert [path.name for path in inside.iterdir()] == [video.name]
+    video.unlink()  # and what is put away can be joined anew
+    (place / names[2]).rename(inside / names[2])
+    join(tmp_path, no_progress)
+    assert np.array_equal(pictures(video), shown)
+
+
+def test_two_files_of_one_chapter_are_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    inside = tmp_path / "videos" / "cam1"
+    for name in ("GX010042.MOV", "GX010042.MP4", "GX020042.MP4"):
+        film(inside / name, 0, 5)
+    assert main(["join", str(tmp_path)]) == 2
+    assert "hold each chapter once, but GX010042.MOV and GX010042.MP4 are the same one" in capsys.readouterr().err
+    assert len(list(inside.iterdir())) == 3
+
+
+def test_another_disk_is_noticed_before_anything_is_written(tmp_path: Path) -> None:
+    other = Path("/dev/shm")
+    if not other.is_dir() or other.stat().st_dev == tmp_path.stat().st_dev:
+        pytest.skip("needs a second file system at /dev/shm")
+    record(tmp_path / "videos" / "cam1", ("GX010042.MP4", "GX020042.MP4", "GX030042.MP4"))
+    with TemporaryDirectory(dir=other) as elsewhere:
+        (tmp_path / "chapters").symlink_to(elsewhere)
+        with pytest.raises(OSError, match="must be on the disk of"):
+            join(tmp_path, no_progress)
+    assert not (tmp_path / "videos" / "cam1.mp4").exists()
+
+
+def test_when_it_was_begun_and_how_its_codec_is_tagged_is_kept(tmp_path: Path) -> None:
+    inside = tmp_path / "videos" / "cam1"
+    coded = ("-c:v", "libx265", "-x265-params", "log-level=none", "-tag:v", "hvc1")
+    for number in (1, 2):
+        begun = ("-metadata", f"creation_time=2026-03-04T05:06:0{number}Z")
+        film(inside / f"GX0{number}0042.MP4", 20 * (number - 1), 20, flags=(*coded, *begun))
+    join(tmp_path, no_progress)
+    with av.open(str(tmp_path / "videos" / "cam1.mp4")) as video:
+        assert video.streams.video[0].codec_context.codec_tag == "hvc1"
+        assert video.metadata["creation_time"].startswith("2026-03-04T05:06:01")

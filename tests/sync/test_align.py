@@ -164,6 +164,22 @@ def test_the_default_tolerance_is_half_a_frame() -> None:
     assert groups.frames[:, 1].tolist() == [*range(9), -1]
 
 
+def test_a_long_recording_is_paired_as_its_trigger_fired() -> None:
+    """Clocks are fitted to some of its frames, drift takes them over several periods."""
+    rng = np.random.default_rng(5)
+    taken = 10**18 + np.arange(60_000) * 11_111_111 + rng.normal(0, 2e5, 60_000)
+    cameras = {}
+    for camera, drift_ppm in {"a": 0, "b": 60, "c": -45}.items():
+        stamped = taken + (taken - taken[0]) * drift_ppm * 1e-6 + rng.normal(0, 2e5, len(taken))
+        there = np.flatnonzero(rng.random(len(taken)) > 0.002)
+        cameras[camera] = Timecodes(times_ns=np.rint(stamped[there]).astype(np.int64), indices=there)
+    groups, _ = align(cameras, AlignOptions(reference="a", clock=ClockMode.TRIGGERED))
+    for column in range(3):
+        there = groups.frames[:, column] >= 0
+        assert there.mean() > 0.99
+        assert np.array_equal(groups.frames[there, column], groups.frames[there, 0])
+
+
 # The reference
 
 
