@@ -58,7 +58,10 @@ class LightOptions:
 
     def __post_init__(self) -> None:
         if self.width < 16 or self.samples < 1:
-            raise ValueError(f"light needs pictures 16 px wide, and a sample: {self.width=}, {self.samples=}")
+            raise ValueError(
+                "light needs pictures 16 px wide, and a sample, but "
+                f"light.width is {self.width}, light.samples {self.samples}"
+            )
         if min(self.least_light, self.least_exposure, self.exposure_sigmas) < 0:
             raise ValueError("least_light, least_exposure and exposure_sigmas must not be negative")
         if not 0 < self.most_left <= 1:

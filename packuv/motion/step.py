@@ -77,11 +77,14 @@ class MotionOptions:
 
     def __post_init__(self) -> None:
         if self.width < 16 or self.flow_width < 16:
-            raise ValueError(f"pictures narrower than 16 px show no motion: {self.width=}, {self.flow_width=}")
+            raise ValueError(
+                "pictures narrower than 16 px show no motion, but motion.width is "
+                f"{self.width}, motion.flow_width {self.flow_width}"
+            )
         if not 0 < self.low_sigmas <= self.high_sigmas or not self.noise_floor > 0 or not self.tau_px > 0:
             raise ValueError(
-                f"thresholds must satisfy 0 < low <= high and be positive: {self.low_sigmas=}, {self.high_sigmas=}, "
-                f"{self.noise_floor=}, {self.tau_px=}"
+                f"thresholds must satisfy 0 < low <= high and be positive, but low_sigmas is {self.low_sigmas}, "
+                f"high_sigmas {self.high_sigmas}, noise_floor {self.noise_floor}, tau_px {self.tau_px}"
             )
         if min(self.closing_px, self.dilation_px, self.least_area_px) < 0 or not self.blur_px > 0:
             raise ValueError("closing_px, dilation_px and least_area_px must not be negative, blur_px positive")

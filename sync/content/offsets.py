@@ -21,6 +21,8 @@ DECIDED = 0.4
 CLEAR = 1.75
 """Standard errors by which pictures must agree better at an offset than two instants beside, or it is chance"""
 LEAST_ERROR = 0.02
+LEAST_REACH = 3
+"""Instants that must be tried to either side for an offset of one to have two beside it"""
 SUSPECTS = 4
 """Cameras of which each is tried as the one that lies"""
 
@@ -38,10 +40,11 @@ class ContentOptions:
     """Farthest offset that is tried, in instants"""
 
     def __post_init__(self) -> None:
-        if min(self.windows, self.reach) < 1 or self.instants < 2 * BLOCKS:
+        if self.windows < 1 or self.instants < 2 * BLOCKS or self.reach < LEAST_REACH:
             raise ValueError(
-                f"a content check needs a window, of {2 * BLOCKS} instants or more, and a reach, each of 1 or more: "
-                f"{self.windows=}, {self.instants=}, {self.reach=}"
+                f"a content check needs a window, of {2 * BLOCKS} instants or more, and a reach of {LEAST_REACH} or "
+                f"more, since an offset is held against those two beside it; but content.windows is {self.windows}, "
+                f"content.instants {self.instants}, content.reach {self.reach}"
             )
 
 

@@ -144,8 +144,12 @@ def _content_findings(report: ReportInput) -> Iterator[Finding]:
     if content.undecided:
         names = content.undecided
         whose = "times of any camera" if len(names) == len(content.cameras) else f"times of {', '.join(names)}"
-        text = f"The pictures do not prove the {whose}: too little moves that several cameras see."
-        yield Finding("sync", text, Severity.NOTE, "Have somebody clap or walk through the volume in the next take.")
+        text = (
+            f"The pictures do not prove the {whose}: too little moves that several cameras see, or they lie farther "
+            "off than content.reach instants."
+        )
+        cure = "Try content.reach=60; have somebody clap or walk through the volume in the next take."
+        yield Finding("sync", text, Severity.NOTE, cure)
 
 
 def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:

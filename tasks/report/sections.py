@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from calibration.rig import Camera
 from sync.align import CameraReport, SyncReport
+from sync.clock import ClockMode
 from tasks.artefacts.recipe import plain
 from tasks.report.facts import (
     LEVELS,
@@ -112,6 +113,14 @@ def _section(name: str, body: Body, found: Sequence[Finding]) -> Section:
     return Section(name, SECTIONS[name], own, body)
 
 
+CLOCKS = {
+    ClockMode.TRUSTED: "Clocks are trusted.",
+    ClockMode.TRIGGERED: "One trigger fired all cameras; offset and drift of their clocks were fitted.",
+    ClockMode.CONTENT: "When each camera began was found from what its pictures show.",
+}
+"""What is known of the times"""
+
+
 def _sync(report: ReportInput, limits: Limits) -> Body:
     sync = report.sync
     if sync is None:
@@ -120,7 +129,7 @@ def _sync(report: ReportInput, limits: Limits) -> Body:
         "reference": sync.reference,
         "tolerance_ms": sync.tolerance_ns / 1e6,
         "period_ms": sync.period_ns / 1e6,
-        "clock": str(sync.clock),
+        "clock": CLOCKS[sync.clock],
         "complete": sync.complete,
         "instants": sync.instants,
         "cameras": [{**_sync_row(row, sync, limits), "content": _content(row.camera, report)} for row in sync.cameras],
