@@ -15,6 +15,7 @@ BENCHMARKS = (
     "codec",
     "content",
     "forecast",
+    "front_end",
     "kills",
     "long",
     "motion",
