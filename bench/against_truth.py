@@ -62,6 +62,8 @@ class Made:
     minutes: int = 10
     """Its length, at 30 frames a second"""
     size: str = "640x360"
+    width: int = 480
+    """To which the pictures that tell places, lenses and light are scaled down, since matching them takes longest"""
     instants: int = 4
     steps: int = 6
     """Steps from frame to frame of the cameras that film motion"""
@@ -127,7 +129,7 @@ class Filmed:
 
     made: Made
     work: Path
-    _shots: dict[int | None, list[dict[str, np.ndarray]]] = field(default_factory=dict)
+    _shots: dict[int, list[dict[str, np.ndarray]]] = field(default_factory=dict)
 
     @classmethod
     def there(cls, made: Made, work: Path) -> Filmed:
@@ -157,7 +159,7 @@ class Filmed:
             cameras.append(whole.resized(width, pinhole.height * width // pinhole.width) if width else whole)
         return Rig(tuple(cameras), "truth")
 
-    def shots(self, width: int | None = None) -> list[dict[str, np.ndarray]]:
+    def shots(self, width: int) -> list[dict[str, np.ndarray]]:
         """The pictures of all cameras, uint8 [H, W, 3], by instant."""
         if width not in self._shots:
             reader = FrameReader(find_capture(self.work / f"{self.made.name}-rig").videos)
@@ -167,7 +169,7 @@ class Filmed:
             ]
         return self._shots[width]
 
-    def _shot(self, reader: FrameReader, camera: Camera, instant: int, width: int | None) -> np.ndarray:
+    def _shot(self, reader: FrameReader, camera: Camera, instant: int, width: int) -> np.ndarray:
         """Through the lens, on a noisy sensor, then scaled."""
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         plane = camera.plane_from_pixels(np.stack([x.ravel(), y.ravel()], axis=1))
@@ -177,8 +179,6 @@ class Filmed:
         filmed = reader.read(camera.name, instant)
         bent = cv2.remap(filmed, across, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         picture = self._noisy(np.asarray(bent), [instant, int(camera.name[-2:])])
-        if width is None:
-            return picture
         return np.asarray(
             cv2.resize(picture, (width, camera.height * width // camera.width), None, 0, 0, cv2.INTER_AREA)
         )
@@ -203,13 +203,13 @@ class Filmed:
     @cached_property
     def points(self) -> SparsePoints:
         """What the default settings triangulate."""
-        return _triangulated(self, SequenceOptions(), None)
+        return _triangulated(self, SequenceOptions(), self.made.width)
 
 
 # What each stage gives: a call to be timed, and then its figures
 
 
-def _sync(filmed: Filmed, options: SequenceOptions, width: int | None, instants: int) -> Iterator[Figures | None]:
+def _sync(filmed: Filmed, options: SequenceOptions, width: int, instants: int) -> Iterator[Figures | None]:
     made = filmed.made
     times = record(made.cameras, made.minutes * 60 * 30, Fraction(30), made.seed, made.clock)
     ticks = {f"cam{number:02}": own.ticks for number, own in enumerate(times, start=1)}
@@ -234,7 +234,7 @@ def _sync(filmed: Filmed, options: SequenceOptions, width: int | None, instants:
     }
 
 
-def _solve(filmed: Filmed, options: SequenceOptions, width: int | None, instants: int) -> Iterator[Figures | None]:
+def _solve(filmed: Filmed, options: SequenceOptions, width: int, instants: int) -> Iterator[Figures | None]:
     shots, truth = filmed.shots(width)[:instants], filmed.rig(width)
     with tempfile.TemporaryDirectory() as folder:
         yield None
@@ -280,14 +280,14 @@ def lens_errors(solved: Rig, truth: Rig) -> Figures:
     }
 
 
-def _triangulated(filmed: Filmed, options: SequenceOptions, width: int | None) -> SparsePoints:
+def _triangulated(filmed: Filmed, options: SequenceOptions, width: int) -> SparsePoints:
     shots = filmed.shots(width)
     later = [instant // APART for instant in options.points.more_instants if instant // APART < len(shots)]
     chosen = [0, *later]
     return triangulate(filmed.rig(width), [shots[instant] for instant in chosen], options=options.points.triangulate)
 
 
-def _points(filmed: Filmed, options: SequenceOptions, width: int | None, instants: int) -> Iterator[Figures | None]:
+def _points(filmed: Filmed, options: SequenceOptions, width: int, instants: int) -> Iterator[Figures | None]:
     filmed.shots(width)
     yield None
     points = _triangulated(filmed, options, width)
@@ -323,8 +323,8 @@ def depth_errors(filmed: Filmed, points: SparsePoints, rig: Rig) -> Figures:
     }
 
 
-def _colour(filmed: Filmed, options: SequenceOptions, width: int | None, instants: int) -> Iterator[Figures | None]:
-    rig, points = filmed.rig(), filmed.points
+def _colour(filmed: Filmed, options: SequenceOptions, width: int, instants: int) -> Iterator[Figures | None]:
+    rig, points = filmed.rig(width), filmed.points
     yield None
     report = balance(rig, points, options=options.points.balance)
     yield None
@@ -347,7 +347,7 @@ def light_error(
     return 100 * float(np.sqrt(np.mean(np.square(errors))))
 
 
-def _flow(filmed: Filmed, options: SequenceOptions, width: int | None, instants: int) -> Iterator[Figures | None]:
+def _flow(filmed: Filmed, options: SequenceOptions, width: int, instants: int) -> Iterator[Figures | None]:
     steps = filmed.steps
     yield None
     flows = [optical_flow(step.before, step.after, options.motion) for step in steps]
@@ -360,7 +360,7 @@ def _flow(filmed: Filmed, options: SequenceOptions, width: int | None, instants:
     yield {"moving_px": float(np.concatenate(moving).mean()), "still_px": float(np.concatenate(still).mean())}
 
 
-def _masks(filmed: Filmed, options: SequenceOptions, width: int | None, instants: int) -> Iterator[Figures | None]:
+def _masks(filmed: Filmed, options: SequenceOptions, width: int, instants: int) -> Iterator[Figures | None]:
     steps = filmed.steps
     yield None
     masks = [_mask(step, options.motion) for step in steps]
@@ -379,7 +379,7 @@ def _mask(step: Step, options: MotionOptions) -> np.ndarray:
     return grown(measure_step(step.before, step.after, options).mask, width, height, options.dilation_px)
 
 
-Stage = Callable[[Filmed, SequenceOptions, int | None, int], Iterator[Figures | None]]
+Stage = Callable[[Filmed, SequenceOptions, int, int], Iterator[Figures | None]]
 """Gets ready, yields, does what is timed, yields, and yields its figures"""
 STAGES: Mapping[str, Stage] = {
     "sync": _sync,
@@ -400,7 +400,7 @@ def measure(
     costs, figures = [], dict[str, Any]()
     with one_opencv_thread():
         for _ in range(REPEATS.get(stage, 1)):
-            work = STAGES[stage](filmed, options, width, instants)
+            work = STAGES[stage](filmed, options, width or filmed.made.width, instants)
             next(work)
             before = _seconds()
             try:

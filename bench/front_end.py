@@ -5,8 +5,8 @@
 
 Writes, after every point, the JSON file, a table beside it as .md and a plot as .svg. A point that the file has with
 the same request is not measured again, and a benchmark that was stopped goes on: the same command again. Knobs are
-settings as for `packuv run --set`, and beside them the number of instants and the width of the videos. The captures are
-made in --work, once.
+settings as for `packuv run --set`, and beside them the number of instants and the width of the pictures. The captures
+are made in --work, once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import command
-from bench.against_truth import CAPTURES, STAGES, Filmed, Made, measure
+from bench.against_truth import CAPTURES, REPEATS, STAGES, Filmed, Made, measure
 from packuv.files import whole_file
 from packuv.kernels.simd import cpu_description
 from pipelines.batch.plan import program_digest
@@ -31,7 +31,9 @@ from pipelines.request import read_settings
 from sync.capture import CaptureSettings
 from tasks.artefacts.recipe import plain
 
-BASE, INSTANTS, WIDTH = "base", "instants", "width of the videos"
+BASE, INSTANTS, WIDTH = "base", "instants", "width of the pictures"
+SMALL = 160
+"""Width of pictures that are only there to compile kernels"""
 Row = dict[str, Any]
 
 
@@ -47,7 +49,7 @@ class Point:
     instants: int = 1
     """That a rig is solved from"""
     width: int | None = None
-    """Of the videos, pixels; None: as the capture is made"""
+    """Of the pictures, pixels; None: as the capture says"""
 
     @property
     def options(self) -> SequenceOptions:
@@ -63,27 +65,27 @@ KNOBS: Mapping[str, Mapping[str, Sequence[object]]] = {
     },
     "solve": {
         INSTANTS: (2, 4),
-        WIDTH: (320, 480),
-        "rig.solve.features.max_features": (512, 1024, 2048, 8192),
-        "rig.solve.features.contrast": (0.01, 0.02, 0.04),
-        "rig.solve.ratio": (0.7, 0.9),
-        "rig.solve.min_pair_matches": (15, 60),
-        "rig.solve.min_pair_share": (0.15, 0.5),
-        "rig.solve.lens": ("PINHOLE", "RADIAL", "OPENCV"),
+        WIDTH: (320, 640),
+        "rig.solve.features.max_features": (512, 1024),
+        "rig.solve.features.contrast": (0.02, 0.04),
+        "rig.solve.ratio": (0.7,),
+        "rig.solve.min_pair_matches": (15,),
+        "rig.solve.min_pair_share": (0.15,),
+        "rig.solve.lens": ("PINHOLE", "OPENCV"),
         "rig.solve.shared_lens": ("true",),
-        "rig.solve.focal_factor": (0.8, 1.6),
+        "rig.solve.focal_factor": (0.8,),
     },
     "points": {
-        "points.more_instants": ("", "15", "15,30,45"),
-        WIDTH: (320, 480),
-        "points.triangulate.features.max_features": (1024, 2048, 8192),
-        "points.triangulate.features.contrast": (0.01, 0.02, 0.04),
-        "points.triangulate.neighbours": (2, 4),
-        "points.triangulate.ratio": (0.7, 0.9),
-        "points.triangulate.epipolar_px": (1.0, 4.0),
-        "points.triangulate.max_error_px": (1.0, 4.0),
+        "points.more_instants": ("", "15"),
+        WIDTH: (320, 640),
+        "points.triangulate.features.max_features": (1024,),
+        "points.triangulate.features.contrast": (0.02,),
+        "points.triangulate.neighbours": (4,),
+        "points.triangulate.ratio": (0.7,),
+        "points.triangulate.epipolar_px": (1.0,),
+        "points.triangulate.max_error_px": (1.0,),
         "points.triangulate.min_views": (2, 4),
-        "points.triangulate.min_angle_deg": (0.5, 5.0),
+        "points.triangulate.min_angle_deg": (5.0,),
         "points.triangulate.patch_px": (5, 15),
     },
     "colour": {
@@ -189,8 +191,8 @@ def run(filmed: Filmed, chosen: Sequence[Point], known: Sequence[Row]) -> Iterat
         request = request_of(filmed.made, point)
         name = json.dumps(request, sort_keys=True)
         if name not in rows:
-            if point.stage not in warm:  # the first call compiles kernels, or loads them
-                measure(point.stage, filmed, Point(point.stage, BASE, BASE).options)
+            if point.stage not in {*REPEATS, *warm}:  # the first call compiles kernels, or loads them
+                measure(point.stage, filmed, Point(point.stage, BASE, BASE).options, SMALL)
                 warm.add(point.stage)
             found = measure(point.stage, filmed, point.options, point.width, point.instants)
             rows[name] = {**found, "request": request}

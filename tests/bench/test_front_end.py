@@ -33,7 +33,7 @@ from pipelines.options import SequenceOptions
 from sync.clock import ClockMode
 from tasks.artefacts.recipe import plain
 
-TINY = replace(CAPTURES[0], cameras=3, size="96x54", instants=2, steps=1, minutes=1)
+TINY = replace(CAPTURES[0], cameras=3, size="96x54", width=96, instants=2, steps=1, minutes=1)
 
 
 @pytest.fixture(scope="module")
