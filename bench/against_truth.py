@@ -230,7 +230,7 @@ def _sync(filmed: Filmed, options: SequenceOptions, width: int, instants: int) -
             late.append(groups.residuals_ns[frames >= 0, column])
     yield {
         "wrong_percent": 100 * float(np.mean(wrong)),
-        "time_us": float(np.sqrt(np.mean(np.square(np.concatenate(late) / 1e3)))),
+        "time_ms": float(np.sqrt(np.mean(np.square(np.concatenate(late) / 1e6)))),
     }
 
 

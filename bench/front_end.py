@@ -148,7 +148,7 @@ NOT_VARIED: Mapping[str, str] = {
 """Why, by the start of their names, the other settings of these stages stand still"""
 PANELS = (
     ("sync", "wrong_percent", "frames wrong, %"),
-    ("sync", "time_us", "time, us"),
+    ("sync", "time_ms", "time, ms"),
     ("solve", "centre_percent", "centre, % of radius"),
     ("solve", "rays_px", "lens, px at 640"),
     ("points", "depth_percent", "depth, %"),

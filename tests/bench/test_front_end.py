@@ -94,9 +94,9 @@ def test_times_that_a_trigger_makes_are_better_where_it_is_known(filmed):
     options = SequenceOptions()
     triggered = measure("sync", filmed, replace(options, sync=replace(options.sync, clock=ClockMode.TRIGGERED)))
     assert trusted["wrong_percent"] == triggered["wrong_percent"] == 0
-    jitter_us = TINY.clock.jitter_us * np.sqrt(2)  # of a camera and of the reference, which no fit can take away
-    assert triggered["time_us"] == pytest.approx(jitter_us, rel=0.05)
-    assert trusted["time_us"] > 1.2 * jitter_us
+    jitter_ms = TINY.clock.jitter_us / 1000 * np.sqrt(2)  # of a camera and of the reference, which no fit can take away
+    assert triggered["time_ms"] == pytest.approx(jitter_ms, rel=0.05)
+    assert trusted["time_ms"] > 1.2 * jitter_ms
 
 
 def test_points_are_measured_whole_and_not_again(filmed, tmp_path, monkeypatch):
