@@ -16,6 +16,7 @@ BENCHMARKS = (
     "compression",
     "content",
     "forecast",
+    "front_end",
     "kills",
     "long",
     "mishaps",
