@@ -183,7 +183,7 @@ def collect(run: Run) -> ReportInput:
 GROUPS = {
     **dict.fromkeys(("clock", "sync"), "sync"),
     **dict.fromkeys(("rig", "light", "points"), "calibrate"),
-    **dict.fromkeys(("motion", "content", "patches", "keyframes"), "flow"),
+    **dict.fromkeys(("motion", "content", "masks", "patches", "keyframes"), "flow"),
     **dict.fromkeys(("background", "backdrop", "key", "segment", "preview"), "fit"),
     **{name: name for name in ("encode", "verify", "evaluate")},
 }

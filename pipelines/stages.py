@@ -19,7 +19,7 @@ from pipelines.chain import Chain, Epoch, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
-from sync.capture import find_capture, find_plate
+from sync.capture import find_capture, find_masks, find_plate
 from sync.clock import ClockMode
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
@@ -39,6 +39,7 @@ from tasks.stages.fitting import (
 )
 from tasks.stages.footage import PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
+from tasks.stages.masks import CheckMasks
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.synchronize import synchronize
@@ -185,6 +186,7 @@ class Sequence:
         take, options = self._take("rig"), self.options
         motion = self._make(FindMotion(take=take, options=options.motion))
         self._compare(take, motion)
+        self._check_masks(take, motion)
         if patches := self._patches(take):
             self._make(ChooseDatedKeyframes(motion=motion, patches=patches, options=options.keyframes))
         else:
@@ -200,6 +202,12 @@ class Sequence:
                 take=take, unseen=unseen, motion=motion, motion_options=options.motion, options=options.content
             )
         )
+
+    def _check_masks(self, take: Take, motion: Key) -> None:
+        masks = find_masks(self.workshop.capture)
+        if masks := {name: path for name, path in masks.items() if name in take.cameras}:
+            files = self.workshop.files(masks, "reading masks")
+            self._make(CheckMasks(take=take, motion=motion, masks=files))
 
     def _patches(self, take: Take) -> Key | None:
         """What changes for good; None where nothing does, so that nothing depends on how that was found."""

@@ -42,6 +42,8 @@ MOST_OFFSET_S = 10**6
 """By which a camera's times may be moved: eleven days"""
 SHARED_TIMECODES = "timestamps.csv"
 SETTINGS = "capture.toml"
+MASKS = "masks"
+"""Folder of foreground masks"""
 SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
 TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10", "linear")
@@ -208,6 +210,47 @@ def find_plate(capture: Capture) -> dict[str, Path]:
     if not any(camera in capture.videos for camera in videos):
         raise ValueError(f"{folder} must have videos of {list(capture.cameras)}, but has {list(videos)}")
     return {camera: videos[camera] for camera in capture.cameras if camera in videos}
+
+
+def find_masks(capture: Capture) -> dict[str, Path]:
+    """Foreground masks by camera, of those of this capture's cameras that have some; opens none.
+
+    Raises ValueError where masks/ holds none, or some of what is no camera.
+    """
+    inside = capture.folder / MASKS
+    if not inside.is_dir():
+        return {}
+    found, ignored = _by_camera(inside, _cameras(inside)), capture.settings.ignore
+    if not found:
+        raise ValueError(
+            f"{inside} must hold masks as <camera>/000000.png or <camera>.mp4, but holds none; take it out"
+        )
+    if unknown := [camera for camera in found if camera not in capture.videos and camera not in ignored]:
+        raise ValueError(
+            f"{found[unknown[0]]} belongs to no video{_suggest(unknown[0], capture.videos)}; name it like its video"
+        )
+    return {camera: found[camera] for camera in capture.cameras if camera in found}
+
+
+def check_masks(capture: Capture, masks: Mapping[str, Path], frames: Mapping[str, int]) -> None:
+    """Raise ValueError unless each camera has as many masks as its video has `frames`, and with the same numbers."""
+    for camera, path in masks.items():
+        count = len(list_pictures(path)) if path.is_dir() else probe_video(path).frame_count
+        if count != frames[camera]:
+            raise ValueError(
+                f"{path} must have a mask for each of the {frames[camera]} frames of {camera}, but has {count}; add "
+                "those that are missing, or take it out"
+            )
+        video = capture.videos[camera]
+        if not (path.is_dir() and video.is_dir()):
+            continue
+        own, wanted = list_pictures(path).numbers, list_pictures(video).numbers
+        if not np.array_equal(own, wanted):
+            odd = int(np.flatnonzero(own != wanted)[0])
+            raise ValueError(
+                f"{path} must have masks with the numbers of the pictures of {camera}, but frame {odd} is picture "
+                f"{wanted[odd]} and mask {own[odd]}; number them alike"
+            )
 
 
 def probe_capture(capture: Capture, tell: Callable[[int, int, str], None] = lambda *_: None) -> dict[str, VideoInfo]:
