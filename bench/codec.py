@@ -383,24 +383,10 @@ def _sequence(options: argparse.Namespace, folder: Path) -> tuple[list[Path], Sc
 
 def _unpacked(path: Path, folder: Path) -> tuple[list[Path], SceneHeader, Any]:
     """The segments of a scene file."""
-    segments = []
     with open_scene(path) as scene:
-        if not scene.index.tolerance.exact:
+        if not scene.lossless:
             raise ValueError(f"{path} is lossy; measure on a lossless scene file")
-        for entry in scene.index.segments:
-            frames = [scene.codes(entry.first + step) for step in range(entry.frames)]
-            count, width = entry.dynamic, frames[0].attributes.shape[1]
-            xyz = np.array([frame.xyz[:count] for frame in frames[1:]], np.uint16).reshape(-1, count, 3)
-            attributes = np.array([frame.attributes[:count] for frame in frames[1:]], np.uint8)
-            segments.append(
-                Segment(
-                    entry.first,
-                    frames[0],
-                    np.arange(entry.rows) < count,
-                    xyz,
-                    attributes.reshape(-1, count, width),
-                )
-            )
+        segments = [scene.segment(number) for number in range(len(scene.index.segments))]
         return _saved(segments, folder), scene.header, f"scene file {path.name}"
 
 

@@ -13,10 +13,12 @@ from pipelines.plugins import Add
 BENCHMARKS = (
     "ablation",
     "codec",
+    "compression",
     "content",
     "forecast",
     "kills",
     "long",
+    "mishaps",
     "motion",
     "pareto",
     "raster",

@@ -39,7 +39,7 @@ from packuv.scene import open_scene
 from pipelines.events import Journal
 from pipelines.process import Engine, There, prepare
 from pipelines.request import RunRequest
-from pipelines.results import Run, collect
+from pipelines.results import Run, collect, remains
 from pipelines.stages import Sequence as Stages
 from studio.capture import SimulateOptions, TruthKind, simulate
 from studio.clocks import EPOCH_NS, ClockOptions, tick_times
@@ -291,7 +291,7 @@ def report(case: Case) -> dict[str, Any]:
     """The report of a run of which everything is there."""
     run = assembled(case)[1]
     start = time.perf_counter()
-    files = write_report(collect(run), case.sequence)
+    files = write_report(collect(remains(run)), case.sequence)
     page = files.page.read_text()
     return {
         "report_seconds": time.perf_counter() - start,

@@ -1,11 +1,16 @@
 """Optical flow and motion masks: run time against error on a filmed synthetic clip with exact truth.
 
     python -m bench.motion [--out motion.json] [--frames 12] [--size 640x360] [--crf 18 23 28]
+        [--raft WEIGHTS ...] [--codec CAPTURE] [--lifted SIMULATED]
 
 Two jointed figures and a ball move before a sparsely textured wall and floor. The clip gets sensor noise and goes
 through H.264, as a capture would; truth comes from the exact transforms of the parts. Error of flow is the endpoint
 error in pixels of the full picture, where things move and where nothing does. Masks are scored against every pixel
 that a moving part covers before or after the step: recall, and false share of the wall beyond a margin.
+
+What a forward-backward check would reject is scored on the same clip, and with --lifted on motion that is lifted into
+the world from the cameras of a simulated capture. --codec holds the codec's motion vectors of a capture against DIS
+(`bench/vectors.py`).
 """
 
 from __future__ import annotations
@@ -25,6 +30,9 @@ import cv2
 import numpy as np
 
 from bench import command
+from bench.consistency import gap_px, lifted_rows
+from bench.vectors import vector_rows
+from packuv.motion.raft import Raft, steady
 from packuv.motion.step import DisPreset, MotionOptions, grown, measure_step, optical_flow
 
 Row = Mapping[str, Any]
@@ -177,6 +185,8 @@ class Pair:
     """bool [H, W]: covered by a moving part before the step"""
     moved: np.ndarray
     """bool [H, W]: covered before or after"""
+    hidden: np.ndarray
+    """bool [H, W]: of `was`, where something else covers the place that it moves to, or the picture ends"""
     far: np.ndarray
     """bool [H, W]: more than 8 px (at 640 wide) from anything that moves"""
 
@@ -189,8 +199,21 @@ def pairs(frames: int, width: int, height: int, crf: int) -> list[Pair]:
     for t in range(1, frames):
         was, moved = owners[t - 1] >= 0, (owners[t - 1] >= 0) | (owners[t] >= 0)
         far = ~grown(moved, width, height, 8 * width // 640)
-        result.append(Pair(greys[t - 1], greys[t], true_flow(parts, owners[t - 1], t), was, moved, far))
+        flow = true_flow(parts, owners[t - 1], t)
+        hidden = was & covered(owners[t - 1], owners[t], flow)
+        result.append(Pair(greys[t - 1], greys[t], flow, was, moved, hidden, far))
     return result
+
+
+def covered(owner: np.ndarray, later: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """Where another part, or none, is at the place that each pixel moves to, bool [H, W]."""
+    height, width = owner.shape
+    grid = np.stack([*np.mgrid[0:height, 0:width]], axis=-1)
+    place = np.rint(grid + flow[..., ::-1]).astype(int)
+    inside = ((place >= 0) & (place < [height, width])).all(axis=2)
+    y, x = np.clip(place, 0, [height - 1, width - 1]).transpose(2, 0, 1)
+    found: np.ndarray = ~inside | (later[y, x] != owner)
+    return found
 
 
 def timed(clip: list[Pair], measure: Callable[[Pair], object]) -> float:
@@ -227,6 +250,49 @@ def flow_rows(clip: list[Pair]) -> Iterator[Row]:
             }
 
 
+def raft_rows(clip: list[Pair], weights: Sequence[Path]) -> Iterator[Row]:
+    """Time and endpoint error by weights, flow width and updates."""
+    for path in weights:
+        for width, updates in ((320, 4), (320, 12), (640, 12)):
+            raft, options = Raft(path, updates=updates), MotionOptions(flow_width=width)
+            flows, times = [], []
+            with steady():
+                for pair in clip:
+                    start = time.process_time()
+                    flows.append(optical_flow(pair.before, pair.after, options, raft))
+                    times.append(time.process_time() - start)
+            errors = [distance(flow, pair.flow) for flow, pair in zip(flows, clip, strict=True)]
+            yield {
+                "weights": path.name,
+                "flow_width": width,
+                "updates": updates,
+                "ms": 1e3 * min(times),
+                "moving_px": float(np.mean([e[p.was].mean() for e, p in zip(errors, clip, strict=True)])),
+                "still_px": float(np.mean([e[p.far].mean() for e, p in zip(errors, clip, strict=True)])),
+            }
+
+
+def check_rows(clip: list[Pair]) -> Iterator[Row]:
+    """What a forward-backward check keeps and rejects of what moves, by the gap that it tolerates."""
+    options = MotionOptions()
+    ways = [(optical_flow(p.before, p.after, options), optical_flow(p.after, p.before, options)) for p in clip]
+    size = clip[0].before.shape
+    gaps = np.stack([gap_px(there, back, size) for there, back in ways])
+    errors = np.stack([distance(there, pair.flow) for (there, _), pair in zip(ways, clip, strict=True)])
+    was, hidden = (np.stack([getattr(pair, name) for pair in clip]) for name in ("was", "hidden"))
+    for tolerance_px in (0.5, 1.0, 2.0):
+        kept = gaps <= tolerance_px
+        yield {
+            "tolerance_px": tolerance_px,
+            "rejected": float((~kept)[was].mean()),
+            "hidden_rejected": float((~kept)[hidden].mean()),
+            "moving_px": float(errors[was].mean()),
+            "moving_seen_px": float(errors[was & ~hidden].mean()),
+            "moving_hidden_px": float(errors[hidden].mean()),
+            "moving_kept_px": float(errors[was & kept].mean()),
+        }
+
+
 def flow_mask(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
     """The paper's mask before dilation."""
     speed = np.linalg.norm(optical_flow(pair.before, pair.after, options), axis=2)
@@ -236,7 +302,7 @@ def flow_mask(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
 
 def both_ways(pair: Pair, tau_px: float, options: MotionOptions) -> np.ndarray:
     """|flow| > tau, forward or backward: where things were and where they are."""
-    back = Pair(pair.after, pair.before, pair.flow, pair.was, pair.moved, pair.far)
+    back = replace(pair, before=pair.after, after=pair.before)
     either: np.ndarray = flow_mask(pair, tau_px, options) | flow_mask(back, tau_px, options)
     return either
 
@@ -294,22 +360,36 @@ def table(rows: Sequence[Row]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = command.parser("motion", __doc__)
-    parser.add_argument("--out", type=Path, help="write all figures as JSON")
+    parser.add_argument("--out", type=Path, help="JSON file; what it holds beside is kept")
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--size", default="640x360")
-    parser.add_argument("--crf", type=int, nargs="+", default=[18, 23, 28])
+    parser.add_argument("--crf", type=int, nargs="*", default=[18, 23, 28], help="none: no clip")
+    parser.add_argument("--raft", type=Path, nargs="+", default=[], metavar="WEIGHTS", help="also RAFT with these")
+    parser.add_argument("--codec", type=Path, metavar="CAPTURE", help="also motion vectors of this capture's videos")
+    parser.add_argument("--lifted", type=Path, metavar="SIMULATED", help="also lifted motion of this simulated capture")
     given = parser.parse_args(arguments)
     width, height = map(int, given.size.split("x"))
     cv2.setNumThreads(1)
-    result: dict[str, list[Row]] = {}
-    for crf in given.crf:
+    result: dict[str, list[Row]] = json.loads(given.out.read_text()) if given.out and given.out.exists() else {}
+    for number, crf in enumerate(given.crf):
         clip = pairs(given.frames, width, height, crf)
-        parts = {"masks": mask_rows} if result else {"flow": flow_rows, "masks": mask_rows}
-        for name, rows in parts.items():
-            result[f"{name}, crf {crf}"] = list(rows(clip))
-            print(f"\n{name}, {width}x{height}, crf {crf}\n{table(result[f'{name}, crf {crf}'])}", flush=True)
+        once = {"flow": flow_rows, "forward-backward check": check_rows} if not number else {}
+        if given.raft and not number:
+            once["raft"] = partial(raft_rows, weights=given.raft)
+        for name, rows in {**once, "masks": mask_rows}.items():
+            tell(result, f"{name}, {given.size}, crf {crf}", rows(clip))
+    if given.codec:
+        tell(result, f"codec vectors, {given.codec.name}", vector_rows(given.codec))
+    if given.lifted:
+        tell(result, f"lifted motion, {given.lifted.name}", lifted_rows(given.lifted))
     if given.out:
-        given.out.write_text(json.dumps(result, indent=1))
+        given.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def tell(result: dict[str, list[Row]], name: str, rows: Iterator[Row]) -> None:
+    """Keep rows under a name, and print them."""
+    result[name] = list(rows)
+    print(f"\n{name}\n{table(result[name])}", flush=True)
 
 
 if __name__ == "__main__":

@@ -164,7 +164,7 @@ def with_colours(rig: Rig, report: ColourReport) -> Rig:
         )
         for camera in rig.cameras
     )
-    return Rig(tuple(cameras), rig.source, rig.metric)
+    return replace(rig, cameras=tuple(cameras))
 
 
 def log_colours(rig: Rig, points: SparsePoints, report: ColourReport) -> np.ndarray:

@@ -29,7 +29,7 @@ def write_colmap(rig: Rig, folder: Path) -> None:
         ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"],
     )
     for number, camera in enumerate(rig.cameras, start=1):
-        model, parameters = _colmap_model(camera)
+        model, parameters = colmap_lens(camera)
         pose = (*_quaternion(camera.camera_from_world[:3, :3]), *camera.camera_from_world[:3, 3])
         lenses.append(f"{number} {model} {camera.width} {camera.height} {_decimals(parameters)}")
         images += [f"{number} {_decimals(pose)} {number} {camera.name}.png", ""]
@@ -85,7 +85,7 @@ def _decimals(values: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in values)  # repr of a float reads back to the same float
 
 
-def _colmap_model(camera: Camera) -> tuple[str, tuple[float, ...]]:
+def colmap_lens(camera: Camera) -> tuple[str, tuple[float, ...]]:
     base = (camera.fx, camera.fy, camera.cx, camera.cy)
     model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV", 8: "FULL_OPENCV"}[len(camera.distortion)]
     model = "OPENCV_FISHEYE" if camera.fisheye else model

@@ -6,7 +6,7 @@ programs. The geometry alone rarely shows it: cameras on a dome still look inwar
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from typing import Any
@@ -17,12 +17,14 @@ from calibration.accept import MatchesReport, PairMatches, Verdict, matches_repo
 from calibration.doubt import WHOLE, doubts
 from calibration.features import Features, pairs_by_look
 from calibration.moved import Standing, find_moved
+from calibration.refine import Refinement, RefineOptions, refine
 from calibration.repair import repair
 from calibration.rig import Rig
 from calibration.triangulate import TriangulateOptions, choose_pairs, detect_all, verified_matches
 from calibration.turned import CLOCKWISE, upright, with_turns
 
 _DEFAULTS = TriangulateOptions()
+_REFINING = RefineOptions()
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -55,6 +57,8 @@ class Judgement:
     """What speaks against single cameras, or all of them (`calibration.doubt`)"""
     mended: Mapping[str, str] = field(default_factory=dict)
     """What was doubted, and is mended in `rig` (`calibration.repair`)"""
+    refined: Refinement | None = None
+    """What adjusting all cameras to all matches did (`calibration.refine`)"""
 
     def to_json(self) -> dict[str, Any]:
         given = self.given.to_json() if self.given else None
@@ -62,7 +66,8 @@ class Judgement:
         doubted = {"doubts": dict(self.doubts)} if self.doubts else {}
         mended = {"mended": dict(self.mended)} if self.mended else {}
         facts = {"reading": self.reading.value, "matches": self.matches.to_json(), "given": given}
-        return {**facts, **turned, **doubted, **mended}
+        refined = {"refined": self.refined.to_json()} if self.refined else {}
+        return {**facts, **turned, **doubted, **mended, **refined}
 
 
 def judge(
@@ -90,12 +95,9 @@ def look_again(
 
     Cameras start late, and a scene may show little at one instant.
     """
-    rig = judgement.rig
-    pairs, evidence = choose_pairs(rig, neighbours=options.neighbours), list(judgement.evidence)
-    for pictures in instants:
-        features = detect_all(rig, pictures, options=options.features)
-        near = [(first, second) for first, second in pairs if first in features and second in features]
-        evidence += verified_matches(rig, features, near, ratio=options.ratio)
+    rig, evidence = judgement.rig, list(judgement.evidence)
+    for found_there in matches_at(rig, instants, options=options):
+        evidence += found_there
         matches = matches_report(rig, evidence, options=options.judge)
         found = doubts(rig, evidence, matches, judge=options.judge)
         judgement = replace(judgement, matches=matches, evidence=evidence, doubts=found)
@@ -115,6 +117,43 @@ def mend(judgement: Judgement, *, options: TriangulateOptions = _DEFAULTS) -> Ju
         return judgement
     mended = {name: f"was wrong, and is mended: {what}" for name, what in done.told.items() if name not in left}
     return replace(judgement, rig=done.rig, matches=matches, doubts=left, mended=mended)
+
+
+def refined(
+    judgement: Judgement,
+    instants: Iterable[Mapping[str, np.ndarray]],
+    *,
+    options: TriangulateOptions = _DEFAULTS,
+    refining: RefineOptions = _REFINING,
+) -> Judgement:
+    """The judgement with a rig adjusted to all matches, where that helps matches that the adjustment did not see.
+
+    Further instants are looked at only when the matches at hand promise a gain. No new doubt may arise.
+    """
+    if judgement.matches.verdict is not Verdict.ACCEPTED:
+        return judgement
+    done = refine(judgement.rig, judgement.evidence, options=refining)
+    if not done.freed:
+        return replace(judgement, refined=done)
+    more = [pair for found in matches_at(judgement.rig, instants, options=options) for pair in found]
+    evidence = [*judgement.evidence, *more]
+    done = refine(judgement.rig, evidence, options=refining)
+    matches = matches_report(done.rig, evidence, options=options.judge)
+    left = doubts(done.rig, evidence, matches, judge=options.judge)
+    if not left.keys() <= judgement.doubts.keys():
+        return replace(judgement, refined=done.declined(judgement.rig, f"it raises doubts of {', '.join(left)}"))
+    return replace(judgement, rig=done.rig, evidence=evidence, matches=matches, doubts=left, refined=done)
+
+
+def matches_at(
+    rig: Rig, instants: Iterable[Mapping[str, np.ndarray]], *, options: TriangulateOptions = _DEFAULTS
+) -> Iterator[list[PairMatches]]:
+    """Verified matches between neighbouring cameras, instant by instant."""
+    pairs = choose_pairs(rig, neighbours=options.neighbours)
+    for pictures in instants:
+        features = detect_all(rig, pictures, options=options.features)
+        near = [(first, second) for first, second in pairs if first in features and second in features]
+        yield verified_matches(rig, features, near, ratio=options.ratio)
 
 
 def _looked(
@@ -201,11 +240,7 @@ def judge_shared(
 
     Its convention is beyond doubt; cameras may have been moved. Raises ValueError for pictures that do not fit the rig.
     """
-    pairs, evidence = choose_pairs(rig, neighbours=options.neighbours), list[PairMatches]()
-    for pictures in instants:
-        features = detect_all(rig, pictures, options=options.features)
-        near = [(first, second) for first, second in pairs if first in features and second in features]
-        evidence += verified_matches(rig, features, near, ratio=options.ratio)
+    evidence = [pair for found in matches_at(rig, instants, options=options) for pair in found]
     standings, moved = find_moved(rig, evidence)
     still = [pair for pair in evidence if not {pair.first, pair.second} & set(moved)]
     kept = rig.select(name for name in rig.names if name not in moved)
@@ -217,7 +252,7 @@ def reread(rig: Rig, reading: Reading) -> Rig:
     if reading is Reading.AS_GIVEN:
         return rig
     cameras = (replace(c, camera_from_world=_reread_pose(c.camera_from_world, reading)) for c in rig.cameras)
-    return Rig(tuple(cameras), f"{rig.source}, read with {reading.value}", rig.metric)
+    return replace(rig, cameras=tuple(cameras), source=f"{rig.source}, read with {reading.value}", up=None)
 
 
 def _reread_pose(pose: np.ndarray, reading: Reading) -> np.ndarray:

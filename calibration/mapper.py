@@ -65,14 +65,24 @@ def _write_lenses(database: pycolmap.Database, spec: Mapping[str, Any]) -> list[
     lenses = []
     for number, camera in enumerate(spec["cameras"], start=1):
         size = (camera["width"], camera["height"])
-        lens = by_size.get(size) if spec["shared_lens"] else None
+        lens = by_size.get(size) if spec["shared_lens"] and "lens" not in camera else None
         if lens is None:
-            lens = pycolmap.Camera.create_from_model_name(number, spec["lens"], spec["focal_factor"] * max(size), *size)
+            lens = _lens(number, camera, spec)
             database.write_camera(lens, use_camera_id=True)
             _write_rig(database, number, lens)
             by_size[size] = lens
         lenses.append(lens)
     return lenses
+
+
+def _lens(number: int, camera: Mapping[str, Any], spec: Mapping[str, Any]) -> pycolmap.Camera:
+    """What is known of it, or a guess."""
+    size = (camera["width"], camera["height"])
+    if known := camera.get("lens"):
+        lens = pycolmap.Camera.create_from_model_name(number, known["model"], max(size), *size)
+        lens.params, lens.has_prior_focal_length = known["numbers"], True
+        return lens
+    return pycolmap.Camera.create_from_model_name(number, spec["lens"], spec["focal_factor"] * max(size), *size)
 
 
 def _write_rig(database: pycolmap.Database, number: int, lens: pycolmap.Camera) -> None:
@@ -96,6 +106,7 @@ def _mapping_options(spec: Mapping[str, Any]) -> pycolmap.IncrementalPipelineOpt
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = spec["seed"]
     options.num_threads = options.mapper.num_threads = spec["threads"]
     options.extract_colors = False
+    options.constant_cameras = {number for number, camera in enumerate(spec["cameras"], 1) if "lens" in camera}
     options.mapper.abs_pose_min_num_inliers = 15  # small studio pictures have few features
     return options
 

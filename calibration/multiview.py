@@ -58,6 +58,14 @@ def locate(
     return sightings.only(seen), xyz[wide], errors[seen]
 
 
+def misses_px(rig: Rig, sightings: Sightings, *, most_px: float = 50.0) -> np.ndarray:
+    """How far each point's sightings lie from where they meet best, root mean square, up to `most_px`: float64 [P]."""
+    geometry = _Geometry(rig)
+    errors = np.minimum(geometry.errors_px(sightings, geometry.points(sightings)), most_px)
+    found: np.ndarray = np.sqrt(_sums(errors**2, sightings) / sightings.views)
+    return found
+
+
 class _Geometry:
     """The rig as arrays, in a frame where its middle is 0 and its size 1, which keeps the linear start well posed."""
 

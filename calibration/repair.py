@@ -94,7 +94,7 @@ def _mended(
     radius = float(np.linalg.norm(rig.centres - rig.centres.mean(axis=0), axis=1).max())
     tried = []
     for fault in faults:
-        change = _change(fault, radius)
+        change = changing(fault, radius)
         values = _fitted(rig, names, seen, fault, change)
         mended = _with(rig, names, change, values)
         tried.append((_median(mended, unseen), fault, values, mended))
@@ -153,7 +153,7 @@ def _median(rig: Rig, evidence: Sequence[PairMatches]) -> float:
 Change = Callable[[Camera, np.ndarray], Camera]
 
 
-def _change(fault: Sequence[str], radius: float) -> Change:
+def changing(fault: Sequence[str], radius: float) -> Change:
     """What the numbers of a fault do to a camera."""
 
     def changed(camera: Camera, values: np.ndarray) -> Camera:

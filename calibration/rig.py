@@ -196,11 +196,15 @@ class Rig:
     """Where the calibration came from, for people: a path or 'COLMAP, instant 0'"""
     metric: bool = False
     """True if the source says that one unit is one metre"""
+    up: tuple[float, float, float] | None = None
+    """Unit vector, world; None where nothing tells it"""
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
         if len(set(names)) != len(names) or not names:
             raise ValueError(f"a rig needs cameras with names of their own, but has {names}")
+        if self.up is not None and not (len(self.up) == 3 and abs(float(np.linalg.norm(self.up)) - 1) < 1e-6):
+            raise ValueError(f"up must be a unit vector of three numbers, but is {self.up}")
 
     def __getitem__(self, name: str) -> Camera:
         for camera in self.cameras:
@@ -219,7 +223,7 @@ class Rig:
 
     def select(self, names: Iterable[str]) -> Rig:
         """The rig of the named cameras, in that order; raises KeyError for a name it lacks."""
-        return Rig(tuple(self[name] for name in names), self.source, self.metric)
+        return replace(self, cameras=tuple(self[name] for name in names))
 
     def resized(self, sizes: Mapping[str, tuple[int, int]]) -> Rig:
         """The rig with pictures of these widths and heights, by camera."""
@@ -228,7 +232,10 @@ class Rig:
     def save(self, path: Path) -> None:
         """Write JSON; docs/calibration.md names every field."""
         cameras = [_camera_to_json(camera) for camera in self.cameras]
-        path.write_text(json.dumps({"source": self.source, "metric": self.metric, "cameras": cameras}, indent=1))
+        # Absent where nobody knows it, so that such rigs keep their bytes.
+        up = {} if self.up is None else {"up": list(self.up)}
+        data = {"source": self.source, "metric": self.metric, **up, "cameras": cameras}
+        path.write_text(json.dumps(data, indent=1))
 
     @classmethod
     def load(cls, path: Path) -> Rig:
@@ -243,7 +250,7 @@ class Rig:
         """The rig of a file's content; raises ValueError that names the file and what it lacks."""
         try:
             cameras = tuple(_camera_from_json(item) for item in data["cameras"])
-            return cls(cameras, str(data["source"]), bool(data["metric"]))
+            return cls(cameras, str(data["source"]), bool(data["metric"]), _direction(data.get("up")))
         except KeyError as missing:
             raise ValueError(f"{path}: a rig file needs the field {missing}; docs/calibration.md lists them") from None
         except (TypeError, OverflowError) as problem:
@@ -310,6 +317,13 @@ def _is_rigid(pose: np.ndarray) -> bool:
         return False
     rotation = pose[:3, :3]
     return bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0)
+
+
+def _direction(numbers: Any) -> tuple[float, float, float] | None:
+    if numbers is None:
+        return None
+    x, y, z = map(float, numbers)
+    return x, y, z
 
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:

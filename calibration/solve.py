@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from calibration.accept import MatchesReport, MatchOptions, PairMatches, Verdict, matches_report
+from calibration.exporters import colmap_lens
 from calibration.features import FeatureOptions, Features, detect, match, pairs_by_look
 from calibration.importers import load_rig
 from calibration.rig import Rig
@@ -69,12 +70,19 @@ class SolveOptions:
             raise ValueError(f"min_registered is a share of the cameras in (0, 1], not {self.min_registered}")
 
 
-def solve_rig(pictures: Mapping[str, np.ndarray | Sequence[np.ndarray]], options: SolveOptions, workspace: Path) -> Rig:
+def solve_rig(
+    pictures: Mapping[str, np.ndarray | Sequence[np.ndarray]],
+    options: SolveOptions,
+    workspace: Path,
+    *,
+    lenses: Rig | None = None,
+) -> Rig:
     """Place the cameras by their pictures, camera -> uint8 [H, W, 3] RGB, one or a list of synchronized instants.
 
     A camera that most of its matches contradict counts as not placed and is left out of the rig. Raises ValueError when
     fewer than two cameras are given, when too few can be placed, or when the placed cameras do not explain the matches;
-    the message says which were placed and what to try. The workspace keeps COLMAP's files, its log, and report.json.
+    the message says which were placed and what to try. `lenses` are known ones of all cameras, which stay as they are;
+    their poses do not count. The workspace keeps COLMAP's files, its log, and report.json.
     The scale and the orientation of the world are arbitrary.
     """
     instants = _instants(pictures)
@@ -83,7 +91,7 @@ def solve_rig(pictures: Mapping[str, np.ndarray | Sequence[np.ndarray]], options
         name: [detect(picture, options=options.features) for picture in shots] for name, shots in instants.items()
     }
     keypoints = {name: _keypoints(shots) for name, shots in features.items()}
-    result = _map(instants, keypoints, _matches(features, keypoints, options), options, workspace)
+    result = _map(instants, keypoints, _matches(features, keypoints, options), options, workspace, lenses)
     placed = _placed(list(instants), result["registered"], options, workspace)
     rig = load_rig(workspace / "model", names=placed)
     report = _judge(rig, keypoints, workspace, options)
@@ -180,6 +188,7 @@ def _map(
     matched: Mapping[str, np.ndarray],
     options: SolveOptions,
     workspace: Path,
+    lenses: Rig | None,
 ) -> dict[str, Any]:
     """Run the mapper; raises ValueError with the end of its log when it fails or takes too long."""
     for stale in ("result.json", "inliers.npz"):
@@ -188,7 +197,7 @@ def _map(
         shutil.rmtree(workspace / stale, ignore_errors=True)
     pixels = {f"keypoints {index}": points.pixels for index, points in enumerate(keypoints.values())}
     np.savez(workspace / "matches.npz", **pixels, **matched)  # type: ignore[arg-type]  # keys are no keywords of savez
-    (workspace / "spec.json").write_text(json.dumps(_spec(instants, options), indent=1))
+    (workspace / "spec.json").write_text(json.dumps(_spec(instants, options, lenses), indent=1))
     command = [sys.executable, "-m", "calibration.mapper", str((workspace / "spec.json").resolve())]
     with (workspace / "mapper.log").open("w") as log:
         try:
@@ -199,10 +208,14 @@ def _map(
     return dict(json.loads((workspace / "result.json").read_text()))
 
 
-def _spec(instants: Mapping[str, Sequence[np.ndarray]], options: SolveOptions) -> dict[str, Any]:
+def _spec(instants: Mapping[str, Sequence[np.ndarray]], options: SolveOptions, lenses: Rig | None) -> dict[str, Any]:
     cameras = [
         {"name": name, "width": shots[0].shape[1], "height": shots[0].shape[0]} for name, shots in instants.items()
     ]
+    if lenses is not None:
+        for camera in cameras:
+            model, numbers = colmap_lens(lenses[camera["name"]])
+            camera["lens"] = {"model": model, "numbers": list(numbers)}
     steering = {key: getattr(options, key) for key in _STEERING}
     return {"cameras": cameras, **steering}
 

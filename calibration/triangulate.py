@@ -337,3 +337,14 @@ def _undistorted_all(rig: Rig, sightings: Sightings) -> np.ndarray:
         mine = sightings.camera == index
         flat[mine] = _undistorted(camera, sightings.pixels[mine])
     return flat.astype(np.float32)
+
+
+def reprojections_px(rig: Rig, points: SparsePoints) -> np.ndarray:
+    """float64 [M]: distance between where each observation is and where the rig, of the cameras of the points, puts
+    it, pixels of the undistorted picture."""
+    poses = np.stack([camera.camera_from_world for camera in rig.cameras])[points.camera]  # [M, 4, 4]
+    seen = np.einsum("mij,mj->mi", poses[:, :3, :3], points.xyz[points.point]) + poses[:, :3, 3]
+    lenses = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in rig.cameras])[points.camera]  # [M, 4]
+    placed = seen[:, :2] / seen[:, 2:] * lenses[:, :2] + lenses[:, 2:]
+    errors: np.ndarray = np.linalg.norm(placed - points.xy, axis=1)
+    return errors

@@ -7,14 +7,15 @@ torchvision, and that only works with the one build of torch that it was made fo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from packuv.threads import one_torch_thread
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -99,7 +100,7 @@ class Lpips:
         """LPIPS of two pictures, float32 [3, H, W] in [0, 1], sRGB; 0 where they are equal."""
         import torch
 
-        with _one_thread(), torch.inference_mode():
+        with one_torch_thread(), torch.inference_mode():
             both = torch.from_numpy(np.stack([picture, truth]).clip(0, 1)).float()  # [2, 3, H, W]
             total = torch.zeros(())
             for head, features in zip(self._heads, self._features(both), strict=True):
@@ -121,19 +122,6 @@ class Lpips:
             if number in self._network.features:
                 found.append(values)
         return found
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Where cores are busy, torch's threads wait for each other: 642 ms of CPU a picture instead of 134 (640x360)."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _known(state: object, path: Path) -> Network:

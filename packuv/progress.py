@@ -26,6 +26,6 @@ class Ticks:
     def __init__(self, progress: Progress, total: int, done: int = 0) -> None:
         self._progress, self._total, self._done = progress, total, done
 
-    def advance(self) -> None:
-        self._done += 1
+    def advance(self, count: int = 1) -> None:
+        self._done += count
         self._progress(self._done, self._total)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from packuv.lpips import lacking
+from packuv.motion import MotionBackend
 from packuv.progress import Progress, no_progress
 from pipelines.choice import affordable, check_judges
 from pipelines.disk import free_bytes
@@ -106,7 +107,7 @@ def look_ahead(request: RunRequest, *, progress: Progress = no_progress) -> Ahea
         size,
         tuple(_steps(expected, made, Store(root))),
         tuple(dict.fromkeys([*_spared(capture, plan, options), *_skips(journal.events)])),
-        tuple(_unknown(capture, request.target_psnr is not None)),
+        tuple(_unknown(capture, options, request.target_psnr is not None)),
         expected,
         machine.probe.moving,
         root,
@@ -159,8 +160,10 @@ def _skips(events: Sequence[Event]) -> Iterator[tuple[str, str]]:
     yield from ((event.label, event.reason) for event in events if event.outcome == "skipped")
 
 
-def _unknown(capture: Capture, pilots: bool) -> Iterator[str]:
+def _unknown(capture: Capture, options: SequenceOptions, pilots: bool) -> Iterator[str]:
     if capture.calibration is None:
         yield "the cameras have to be solved, which takes minutes to hours more"
+    if options.motion.backend is MotionBackend.RAFT:
+        yield "optical flow by RAFT takes half a second to seconds a picture more without a GPU"
     if pilots:
         yield "pilots of --target-psnr"

@@ -213,6 +213,9 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
             "verify", "pipelines.commands.scenes:verify", "check a scene file bit by bit, or the artefacts of a run"
         )
     )
+    _compress(
+        command("compress", "pipelines.commands.compress:command", "write a smaller scene file of a lossless one")
+    )
     _export(command("export", "", "write frames, cameras or the atlas of a scene for other programs"))
     _import(command("import", "pipelines.commands.exchange:import_splats", "turn splat files into a scene file"))
     _atlas(command("atlas", "pipelines.commands.exchange:atlas", "write the UV atlas of a frame as a picture"))
@@ -223,6 +226,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _worker(command("worker", "pipelines.commands.worker:worker", "make stages here for runs with --cluster"))
     _status(command("status", "pipelines.commands.watch:status", "tell what runs, what failed and what is done"))
     _cancel(command("cancel", "pipelines.commands.watch:cancel", "end runs within seconds; they can go on later"))
+    _report(command("report", "pipelines.commands.report:command", "write the report of a run anew, or compare runs"))
     _view(command("view", "pipelines.commands.scenes:view", "show a scene in the web browser"))
     _clean(command("clean", "pipelines.commands.stores:clean", "remove from stores what no run needs, or hold a quota"))
     command("doctor", "pipelines.commands.doctor:doctor", "tell what this machine has and lacks")
@@ -521,6 +525,25 @@ def _web(command: argparse.ArgumentParser) -> None:
     _json(command)
 
 
+def _compress(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    goal = command.add_mutually_exclusive_group(required=True)
+    goal.add_argument("--ratio", type=float, default=None, metavar="N", help="N times smaller than the scene, at least")
+    goal.add_argument(
+        "--loss-db", type=float, default=None, metavar="DB", help="PSNR against footage that may be lost, about"
+    )
+    known = command.add_mutually_exclusive_group()
+    known.add_argument(
+        "--capture", type=Path, default=None, metavar="CAPTURE", help="score both scenes against this capture folder"
+    )
+    known.add_argument(
+        "--fitted-db", type=float, default=None, metavar="DB", help="PSNR of the scene against footage (taken for 30)"
+    )
+    _seed(command)
+    _output(command, "FILE", "scene file to write")
+    _json(command)
+
+
 def _render(command: argparse.ArgumentParser) -> None:
     _scene(command)
     command.add_argument("--camera", required=True, metavar="NAME|FILE", help="a camera of the scene, or a JSON file")
@@ -542,6 +565,16 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="torchvision's AlexNet or VGG-16 weights, to measure LPIPS",
     )
+    _json(command)
+
+
+def _report(command: argparse.ArgumentParser) -> None:
+    command.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a run")
+    command.add_argument(
+        "--compare", type=Path, nargs=2, default=None, metavar=("A", "B"), help="what differs between two runs"
+    )
+    command.add_argument("--dataset", type=Path, default=None, metavar="DIR", help="all runs of an output folder")
+    _set(command, "a limit of the report, as report.psnr_db=25")
     _json(command)
 
 

@@ -45,8 +45,8 @@ LADDER: Mapping[str, Mapping[str, Any]] = {
     "draft": _point(640, (900, 400, 144), 0.1, (42_000, 60_000)),
     "medium": _point(960, (1800, 700, 288), 0.04, (45_000, 64_000)),
     "standard": _point(1280, (3000, 1200, 480), 0.02, (48_000, 68_000)),
-    "fine": _point(1920, (7000, 2000, 800), 0.01, (48_000, 68_000)),
-    "high": _point(None, (15_000, 4000, 1200), 0.005, (42_000, 60_000), sh_degree=3),
+    "fine": _point(1920, (3000, 1200, 560), 0.014, (58_000, 84_000)),
+    "high": _point(None, (3000, 1200, 640), 0.01, (70_000, 100_000), sh_degree=3),
 }
 """Settings, as for `packuv run --set`, by name"""
 assert tuple(name for name in LADDER if name in PRESETS) == PRESETS

@@ -25,11 +25,11 @@ from pipelines.folder import claim
 from pipelines.forecast import Forecast, Guess, Machine, forecast, machine_of, question_of, size_of, size_told
 from pipelines.ladder import up_to
 from pipelines.lender import lender_of
-from pipelines.options import SequenceOptions, compose
+from pipelines.options import SequenceOptions, check_raft, compose
 from pipelines.probe import remembered
 from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
-from pipelines.results import Ending, Run, collect, ending_of, run_json
+from pipelines.results import Ending, Run, collect, ending_of, remains, run_json
 from pipelines.stages import Made, Sequence
 from sync.capture import Capture, check_name, find_capture
 from tasks.artefacts.jobs import CancelledError, JobError, Jobs
@@ -41,11 +41,13 @@ from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Maker, Workshop, make_here
 from tasks.report.facts import Choice
 from tasks.report.findings import Finding, findings
-from tasks.report.record import summary
+from tasks.report.summary import summary
+from tasks.report.verdict import Verdict, verdict
 from tasks.report.write import write_report
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import METRICS
 from tasks.stages.plan import Plan
+from tasks.stages.scale import known_of
 from tasks.stages.synchronize import read_videos
 
 PARTIAL = "scene.partial.mkv"
@@ -70,7 +72,9 @@ class Outcome:
     """The report's summary: PSNR, SSIM, size, time; None where there is none"""
     events: tuple[Event, ...]
     findings: tuple[Finding, ...]
-    """What in the results a person should look at"""
+    """What in the results a person should look at, the worst first"""
+    verdict: Verdict | None = None
+    """Whether they may be delivered"""
     choice: Choice | None = None
     """Where a time or an error was asked for"""
 
@@ -87,6 +91,7 @@ class Outcome:
             "report": str(self.report),
             "summary": dict(self.figures),
             "choice": plain(self.choice),
+            "verdict": plain(self.verdict),
             "findings": [finding.text for finding in self.findings],
             "stages": [event.to_json() for event in self.events],
         }
@@ -94,6 +99,8 @@ class Outcome:
     def farewell(self) -> str:
         """The last lines of a run."""
         lines = [*_doubts(self.findings), *_quality(self.figures), f"results    {self.folder}"]
+        if self.verdict:
+            lines.insert(0, f"verdict    {self.verdict.text}")
         if self.choice:
             lines.insert(0, f"chosen     {self.choice.told}")
         if self.scene:
@@ -264,8 +271,13 @@ def points_of(request: RunRequest, capture: Capture) -> dict[str, SequenceOption
 
 
 def options_of(request: RunRequest, capture: Capture, point: str) -> SequenceOptions:
-    """Of a run with the settings of this point of the ladder."""
-    return compose(point, capture.settings, request.settings, seed=request.seed, quality=request.quality)
+    """Of a run with the settings of this point of the ladder.
+
+    Raises OptionError, or ValueError for weights that RAFT cannot work with.
+    """
+    options = compose(point, capture.settings, request.settings, seed=request.seed, quality=request.quality)
+    check_raft(options)
+    return options
 
 
 def settle(sequence: Sequence, run: Run, engine: Engine, affordable: Affordable) -> tuple[Sequence, Run]:
@@ -314,7 +326,8 @@ def prepare(
     choice = chosen_of(request, affordable[-1]) if affordable else None
     options = options_of(request, capture, choice.point if choice else request.preset)
     plan = plan_of(request, capture)
-    options = replace(options, fit=replace(options.fit, device=plan.device))
+    device = plan.device
+    options = replace(options, fit=replace(options.fit, device=device), raft=replace(options.raft, device=device))
     folder = Path(request.out) / capture.name
     claim(folder, capture)
     originals = Originals(capture, folder / "file_digests.json")
@@ -334,7 +347,9 @@ def find_sequence(request: RunRequest) -> Capture:
 
 
 def plan_of(request: RunRequest, capture: Capture) -> Plan:
-    """What the request means for this capture; raises ValueError for cameras that it lacks or a missing GPU."""
+    """What the request means for this capture; raises ValueError for cameras that it lacks or a missing GPU, or where
+    capture.toml says of the rig's size what cannot be."""
+    known_of(capture)
     first, stop = request.instants
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
     device, side_by_side = choose_device(request.device), jobs_at_once(request) > 1
@@ -372,11 +387,13 @@ def _publish(run: Run, folder: Path) -> Outcome:
         place(run.workshop.path(key) / SCENE, scene)
         (folder / PARTIAL).unlink(missing_ok=True)
     run.journal.started("report")
-    content = collect(run)
-    report = write_report(content, folder)
+    content = collect(remains(run))
+    limits = run.options.report
+    report = write_report(content, folder, limits=limits)
     run.journal.ended("report")
-    events, found = tuple(run.journal.events), findings(content)
-    return Outcome(folder, scene, report.page, summary(content), events, found, content.choice)
+    events, found = tuple(run.journal.events), findings(content, limits)
+    judged = verdict(content, limits, found)
+    return Outcome(folder, scene, report.page, summary(content), events, found, judged, content.choice)
 
 
 def place(source: Path, target: Path) -> None:

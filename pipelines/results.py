@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import platform
 import shlex
 import socket
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,9 @@ import numpy as np
 
 import packuv
 from calibration.accept import RigReport
+from calibration.colour import ColourModel
 from calibration.rig import Rig
+from calibration.triangulate import SparsePoints, reprojections_px
 from packuv.footage import Light, damage_told
 from packuv.scene import open_scene
 from packuv.score import read_table
@@ -28,10 +33,11 @@ from pipelines.stages import Made
 from sync.align import SyncReport
 from sync.content import Content
 from tasks.artefacts.jobs import CancelledError
-from tasks.artefacts.recipe import plain
-from tasks.artefacts.store import Store
+from tasks.artefacts.recipe import plain, restore
+from tasks.artefacts.store import Key, Store
 from tasks.artefacts.workshop import Workshop
 from tasks.report.facts import (
+    CameraEvidence,
     Choice,
     Compared,
     Comparison,
@@ -46,7 +52,7 @@ from tasks.report.facts import (
     scene_figures,
 )
 from tasks.report.write import JSON_NAME, PAGE_NAME
-from tasks.stages.calibrate import CHECK
+from tasks.stages.calibrate import CHECK, COLOUR, POINTS
 from tasks.stages.content import read_content
 from tasks.stages.encode import SCENE
 from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
@@ -147,23 +153,137 @@ def check_whole(folder: Path) -> None:
             raise OSError(f"the run came to its end, but {folder / name} is not there; run the same command again")
 
 
-def collect(run: Run) -> ReportInput:
-    """What the stages left, for the report; parts that the run did not come to are missing."""
-    now, scores = datetime.now(UTC), _scores(run.folder("evaluate"))
-    seconds = (now - run.started).total_seconds()
-    rig_folder, sync_folder = run.folder("points") or run.folder("rig"), run.folder("sync")
-    return ReportInput(
+@dataclass(frozen=True)
+class Remains:
+    """What a report is made of: a run that ends, or what one left in its folder."""
+
+    name: str
+    command: str
+    options: SequenceOptions
+    versions: Mapping[str, str]
+    host: str
+    finished: str
+    """UTC, ISO 8601"""
+    seconds: float
+    """From start to end"""
+    held_out: tuple[str, ...]
+    store: Store
+    made: Made
+    events: Sequence[Event]
+    choice: Choice | None
+    forecast: Forecast | None
+
+    def folder(self, stage: str) -> Path | None:
+        """Folder of the first artefact of a stage, or None if the run did not come to it."""
+        key = self.made.get(stage)
+        return self.store.path(key) if key else None
+
+
+def remains(run: Run) -> Remains:
+    """Of a run that ends now."""
+    now = datetime.now(UTC)
+    return Remains(
         name=run.name,
         command=shlex.join(sys.argv),
         options=run.options,
-        versions={"packuv": packuv.__version__, "python": sys.version.split()[0]},
+        versions=versions(),
         host=f"{socket.gethostname()}, {run.workshop.jobs.threads} threads a job, {run.plan.device}",
         finished=now.isoformat(timespec="seconds"),
-        seconds=seconds,
+        seconds=(now - run.started).total_seconds(),
+        held_out=run.plan.held_out,
+        store=run.workshop.store,
+        made=run.made,
+        events=run.journal.events,
+        choice=run.choice,
+        forecast=run.forecast,
+    )
+
+
+PACKAGES = ("torch", "torchcodec", "numpy", "numba", "av", "opencv-python-headless", "pycolmap", "prefect", "gsplat")
+"""Whose versions may change results, or how long they take"""
+
+
+def versions() -> dict[str, str]:
+    """Of what makes results here; packages that are not there are left out."""
+    found = {"packuv": packuv.__version__, "python": sys.version.split()[0], "system": platform.platform()}
+    for name in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
+def remains_in(folder: Path) -> Remains:
+    """Of the run that last ended in the folder of a sequence.
+
+    Raises FileNotFoundError where there is none, or what it made is gone, ValueError for files of another version.
+    """
+    told, reported = (_told(folder / name) for name in ("run.json", JSON_NAME))
+    store, made = Store(folder / "store"), Made()
+    try:
+        for item in told["artefacts"]:
+            stage, _, digest = item["artefact"].partition("/")
+            made.add(Key(stage, digest, reused=True))
+        record = Remains(
+            name=told["sequence"],
+            command=reported["run"]["command"],
+            options=restore(SequenceOptions, told["options"]),
+            versions=reported["run"]["versions"],
+            host=reported["run"]["host"],
+            finished=reported["run"]["finished"],
+            seconds=reported["run"]["seconds"],
+            held_out=tuple(told["cameras"]["held_out"]),
+            store=store,
+            made=made,
+            events=[event_of(stage) for stage in told["stages"]],
+            choice=restore(Choice | None, told["choice"]),
+            forecast=restore(Forecast | None, told["forecast"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"{folder} was written by another version of packuv ({error}); run it again") from None
+    for stage in SHOWN:
+        if (key := made.get(stage)) and not store.holds(key):
+            raise FileNotFoundError(f"the report needs {key}, which is gone from {store.root}; run the same again")
+    return record
+
+
+SHOWN = ("sync", "rig", "light", "points", "content", "patches", "keyframes", "encode", "verify", "evaluate")
+"""Stages whose artefacts a report reads"""
+
+
+def _told(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path.parent} must be the folder of a run that ended, but has no {path.name}")
+    try:
+        told: dict[str, Any] = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} must hold JSON as packuv writes it: {error}") from None
+    return told
+
+
+def event_of(stage: Mapping[str, Any]) -> Event:
+    """Of a stage in run.json."""
+    kind, _, digest = stage.get("artefact", "").partition("/")
+    key = Key(kind, digest, reused=stage["outcome"] == "reused") if digest else None
+    return Event(stage["stage"], stage["outcome"], stage["seconds"], key, stage.get("reason", ""))
+
+
+def collect(run: Remains) -> ReportInput:
+    """What the stages left, for the report; parts that the run did not come to are missing."""
+    scores = _scores(run.folder("evaluate"))
+    rig_folder, sync_folder = run.folder("points") or run.folder("rig"), run.folder("sync")
+    return ReportInput(
+        name=run.name,
+        command=run.command,
+        options=run.options,
+        versions=run.versions,
+        host=run.host,
+        finished=run.finished,
+        seconds=run.seconds,
         sync=SyncReport.load(sync_folder) if sync_folder else None,
         rig=Rig.load(rig_folder / RIG) if rig_folder else None,
-        held_out=run.plan.held_out,
+        held_out=run.held_out,
         check=_check(run),
+        evidence=_evidence(run.folder("points")),
         content=_content(run.folder("content")),
         footage=tuple(_footage_notes(run)),
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
@@ -174,9 +294,9 @@ def collect(run: Run) -> ReportInput:
         scores=scores,
         scene=_scene(run),
         pictures=tuple(_pictures(run.folder("evaluate"))),
-        stages=tuple(_stage(run.workshop.store, event) for event in run.journal.events),
+        stages=tuple(_stage(run.store, event) for event in run.events),
         forecast=tuple(_compared(run)),
-        choice=run.choice and replace(run.choice, minutes=seconds / 60, psnr_db=_level(scores)),
+        choice=run.choice and replace(run.choice, minutes=run.seconds / 60, psnr_db=_level(scores)),
     )
 
 
@@ -190,22 +310,24 @@ GROUPS = {
 """Stage that each kind of artefact belongs to"""
 
 
-def _compared(run: Run) -> Iterator[Compared]:
-    """What was forecast beside what came. Times are those of what the run is made of, whoever made it, in the order of
-    a machine that does one thing at a time."""
+def _compared(run: Remains) -> Iterator[Compared]:
+    """What was forecast beside what came. Times of stages are work: sums over what the run is made of, whoever made it.
+    The total is that of the run from start to end, and what a run that reused nothing would have done beside."""
     if run.forecast is None:
         return
     receipts = [
-        (key.stage, run.workshop.store.receipt(key))
+        (key.stage, run.store.receipt(key))
         for keys in run.made.keys.values()
         for key in keys
-        if run.workshop.store.holds(key)  # what another take lends lies in a store of its own
+        if run.store.holds(key)  # what another take lends lies in a store of its own
     ]
     for stage, seconds in run.forecast.seconds.items():
         took = [receipt.seconds for name, receipt in receipts if GROUPS[name] == stage]
         yield Compared(stage, "min", seconds / 60, sum(took) / 60 if took else None)
-    whole = sum(receipt.seconds for _, receipt in receipts)
-    yield Compared("in all", "min", run.forecast.minutes, whole / 60)
+    there = {event.key for event in run.events if event.key and event.outcome == "reused"}
+    before = sum(run.store.receipt(key).seconds for key in there if run.store.holds(key))
+    name = "total time" if not before else "total time, with what was there before"
+    yield Compared(name, "min", run.forecast.minutes, (run.seconds + before) / 60)
     peak = max((receipt.peak_memory_bytes for _, receipt in receipts), default=0)
     yield Compared("memory of the largest job", "GB", run.forecast.memory_bytes / 1e9, peak / 1e9)
     kept = sum(receipt.size_bytes for _, receipt in receipts)
@@ -221,19 +343,49 @@ def _level(scores: Sequence[FrameScore]) -> float | None:
     return float(np.mean([np.mean([score.level_db for score in own]) for own in cameras])) if cameras else None
 
 
-def _check(run: Run) -> RigReport | None:
+def _check(run: Remains) -> RigReport | None:
     folder, background = run.folder("rig"), run.made.get("background")
     if folder is None:
         return None
     report = RigReport(**json.loads((folder / CHECK).read_text()))
-    refused = run.workshop.store.receipt(background).notes.get(REFUSED, {}) if background else {}
+    refused = run.store.receipt(background).notes.get(REFUSED, {}) if background else {}
     return replace(report, suspicious={**report.suspicious, **refused})
 
 
-def _footage_notes(run: Run) -> Iterator[str]:
+def _evidence(folder: Path | None) -> dict[str, CameraEvidence]:
+    if folder is None or not (folder / COLOUR).is_file():
+        return {}
+    rig, points = Rig.load(folder / RIG), SparsePoints.load(folder / POINTS)
+    colour = json.loads((folder / COLOUR).read_text())
+    errors = reprojections_px(rig.select(points.cameras), points)
+    found = {}
+    for name in rig.names:
+        seen = errors[points.camera == points.cameras.index(name)] if name in points.cameras else None
+        found[name] = CameraEvidence(
+            points=colour["observations"].get(name),
+            error_px=float(np.median(seen)) if seen is not None and len(seen) else None,
+            gain=_gain_told(name, colour),
+        )
+    return found
+
+
+def _gain_told(name: str, colour: Mapping[str, Any]) -> str:
+    """Whether a camera's gain was measured, for people."""
+    held = colour["held_out"].get(name)
+    if held is None:
+        if name in colour["weak_cameras"]:
+            return f"not measured: only {colour['observations'].get(name, 0)} points"
+        return "measured with the others" if colour["model"] != str(ColourModel.NONE) else "none: it does not pay"
+    if held["spread_before"] is None:
+        return f"not measured: only {held['observations']} points"
+    told = f"{held['spread_after']:.1%} off instead of {held['spread_before']:.1%}"
+    return f"measured after the fit: {told}" if held["kept"] else f"not measured: it would be {told}"
+
+
+def _footage_notes(run: Remains) -> Iterator[str]:
     sync, light = run.made.get("sync"), run.folder("light")
     if sync:
-        yield from run.workshop.store.receipt(sync).notes.get(FOOTAGE, ())
+        yield from run.store.receipt(sync).notes.get(FOOTAGE, ())
     if light:
         yield from (damage_told(name, facts) for name, facts in read_damage(light).items())
     elif run.folder("points"):
@@ -244,9 +396,9 @@ def _content(folder: Path | None) -> Content | None:
     return read_content(folder) if folder else None
 
 
-def _points_notes(run: Run) -> Mapping[str, Any]:
+def _points_notes(run: Remains) -> Mapping[str, Any]:
     points = run.made.get("points")
-    return run.workshop.store.receipt(points).notes if points else {}
+    return run.store.receipt(points).notes if points else {}
 
 
 def _light(folder: Path | None) -> LightCurve | None:
@@ -256,11 +408,11 @@ def _light(folder: Path | None) -> LightCurve | None:
     return LightCurve(light.light, light.exposures, read_steady(folder))
 
 
-def _curve(run: Run) -> MotionCurve | None:
+def _curve(run: Remains) -> MotionCurve | None:
     folder, patches = run.folder("keyframes"), run.made.get("patches")
     if folder is None:
         return None
-    notes = run.workshop.store.receipt(patches).notes if patches else {"patches": (), "cuts": ()}
+    notes = run.store.receipt(patches).notes if patches else {"patches": (), "cuts": ()}
     changes = tuple(LastingChange(patch["instant"], tuple(patch["cameras"])) for patch in notes["patches"])
     return MotionCurve(np.array(read_curve(folder)), tuple(read_keyframes(folder)), changes, tuple(notes["cuts"]))
 
@@ -269,7 +421,7 @@ def _scores(folder: Path | None) -> tuple[FrameScore, ...]:
     return frame_scores(read_table(folder / TABLE)) if folder else ()
 
 
-def _scene(run: Run) -> SceneFigures | None:
+def _scene(run: Remains) -> SceneFigures | None:
     folder = run.folder("encode")
     if folder is None:
         return None

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from packuv.fit.options import FirstOptions, NextOptions
 from packuv.lpips import lacking
+from packuv.motion import MotionBackend
 from packuv.motion.keyframes import fitting_order
 from packuv.motion.patches import epochs
 from pipelines.chain import Chain, Epoch, Submit
@@ -24,7 +25,7 @@ from sync.clock import ClockMode
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.calibrate import FindPoints, borrow_rig, find_rig, read_names
+from tasks.stages.calibrate import FindPoints, ImportRig, SolveRig, borrow_rig, find_rig, read_names
 from tasks.stages.clock import find_starts
 from tasks.stages.content import CompareContent
 from tasks.stages.encode import Encode, Verify
@@ -42,8 +43,18 @@ from tasks.stages.light import MeasureLight, is_steady
 from tasks.stages.masks import CheckMasks
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
+from tasks.stages.scale import ScaleRig, known_of
 from tasks.stages.synchronize import synchronize
-from tasks.stages.track import ChooseDatedKeyframes, ChooseKeyframes, DatePatches, FindMotion, read_patches, read_spans
+from tasks.stages.track import (
+    RAFT,
+    ChooseDatedKeyframes,
+    ChooseKeyframes,
+    DatePatches,
+    FindMotion,
+    FindMotionByRaft,
+    read_patches,
+    read_spans,
+)
 
 
 @dataclass
@@ -177,20 +188,39 @@ class Sequence:
         """The rig: this take's own, or that of the lender, which makes it unless it is there."""
         groups, pictures, options = self.made.only("sync"), self.options.pictures, self.options.rig
         if self.lender is None:
-            return self._make(find_rig(self.workshop, self.plan, groups, pictures, options))
+            return self._scale(find_rig(self.workshop, self.plan, groups, pictures, options))
         self.lender.run("sync")
         lent = self.lender._place()
         return self._make(borrow_rig(self.workshop, self.plan, groups, pictures, self.lender.workshop, lent, options))
 
+    def _scale(self, placed: ImportRig | SolveRig) -> Key:
+        """The rig as it was placed or, where capture.toml knows its size or up, brought to that."""
+        known = known_of(self.workshop.capture)
+        if not known:
+            return self._make(placed)
+        rig, options = self.submit(placed).result(), self.options
+        take = replace(placed.take, rig=rig, cameras=read_names(self.workshop.path(rig)))
+        return self._make(
+            ScaleRig(take=take, first=self.plan.first, known=known, check=options.rig.check, options=options.scale)
+        )
+
     def _track(self) -> None:
         take, options = self._take("rig"), self.options
-        motion = self._make(FindMotion(take=take, options=options.motion))
+        motion = self._make(self._motion(take))
         self._compare(take, motion)
         self._check_masks(take, motion)
         if patches := self._patches(take):
             self._make(ChooseDatedKeyframes(motion=motion, patches=patches, options=options.keyframes))
         else:
             self._make(ChooseKeyframes(motion=motion, options=options.keyframes))
+
+    def _motion(self, take: Take) -> FindMotion:
+        motion, raft = self.options.motion, self.options.raft
+        if motion.backend is not MotionBackend.RAFT or raft.weights is None:
+            return FindMotion(take=take, options=motion)
+        weights = Path(raft.weights).resolve()
+        network, unnamed = self.workshop.files({RAFT: weights}, "motion"), replace(raft, weights=None)
+        return FindMotionByRaft(take=take, options=motion, network=network, raft=unnamed, weights=str(weights))
 
     def _compare(self, take: Take, motion: Key) -> None:
         if not self.options.content.enabled:

@@ -19,6 +19,7 @@ import numpy as np
 from sync.chapters import unjoined
 from sync.clock import ClockMode
 from sync.natural import natural_key
+from sync.offsets import MOST_OFFSET_S, find_offsets, offset_notes, read_offsets
 from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
 from sync.probe import VideoInfo, container_timecodes, probe_video
 from sync.timecode import NANOSECONDS, SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
@@ -38,8 +39,6 @@ LABELS_APART = 1.5
 BEGUN_APART_S, CLOCKS_SET_S = 1.5, 3600
 """Seconds that creation_time, which counts whole ones, must lie apart to mean something, and at most, or a clock is not
 set"""
-MOST_OFFSET_S = 10**6
-"""By which a camera's times may be moved: eleven days"""
 SHARED_TIMECODES = "timestamps.csv"
 SETTINGS = "capture.toml"
 MASKS = "masks"
@@ -48,6 +47,9 @@ SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
 TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10", "linear")
 """Values of `transfer` in capture.toml; what they mean is packuv's, see `packuv.footage.transfer`."""
+UPWARD = ("board", "cameras")
+"""Values of `up` in capture.toml that are no direction: the side of a board that lies on the floor, or as the cameras
+are held"""
 SIDECAR_SUFFIXES = frozenset(
     {".aac", ".csv", ".db", ".ini", ".jpeg", ".jpg", ".json", ".log", ".lrv", ".m4a", ".md", ".mp3", ".pdf", ".png"}
     | {".srt", ".thm", ".toml", ".txt", ".wav", ".xml", ".yaml", ".yml"}
@@ -87,6 +89,12 @@ class CaptureSettings:
     """Capture folder whose rig is this one's, beside this folder or absolute"""
     clean_plate: str | None = None
     """Folder with videos of the empty stage, filmed by the same rig; likewise"""
+    board: Mapping[str, Any] | None = None
+    """A board of known size that the videos show; what its keys mean is calibration's, see `calibration.board.Board`"""
+    distance: tuple[Mapping[str, Any], ...] = ()
+    """Known distances, likewise, see `calibration.scale.Distance`"""
+    up: str | tuple[float, float, float] | None = None
+    """Where up is: one of UPWARD, or a direction in the calibration's world; None leaves it open"""
 
     @classmethod
     def read(cls, path: Path) -> CaptureSettings:
@@ -120,6 +128,8 @@ class Capture:
     calibration: Path | None
     """File or folder to import; None means that the rig must be solved"""
     settings: CaptureSettings = field(default_factory=CaptureSettings)
+    offsets: Path | None = None
+    """t_offsets.json, where there is one"""
     notes: tuple[str, ...] = field(default=(), compare=False)
     """What lies beside the videos and was passed over, one sentence each"""
 
@@ -150,6 +160,7 @@ def find_capture(folder: Path) -> Capture:
     timecodes = _find_timecodes(folder, videos)
     if settings.rig_from is not None and settings.calibration is not None:
         raise ValueError(f"{path}: the rig comes from rig_from or from calibration, not both; take one of them out")
+    _check_scale(path, settings)
     return Capture(
         folder=folder,
         name=_name(folder, settings),
@@ -157,6 +168,7 @@ def find_capture(folder: Path) -> Capture:
         timecodes={camera: timecodes[camera] for camera in kept if camera in timecodes},
         calibration=_find_calibration(folder, settings.calibration),
         settings=settings,
+        offsets=find_offsets(folder),
         notes=_passed_over(folder, inside, videos),
     )
 
@@ -292,13 +304,31 @@ def picture_notes(capture: Capture, infos: Mapping[str, VideoInfo]) -> tuple[str
     return tuple(notes)
 
 
-def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
+def timing_notes(capture: Capture, infos: Mapping[str, VideoInfo], clock: ClockMode) -> tuple[str, ...]:
+    """How t_offsets.json was understood, or why it was not."""
+    if capture.offsets is None:
+        return ()
+    if clock is not ClockMode.TRUSTED:
+        why = {
+            ClockMode.TRIGGERED: "by which the cameras film at the same times, whatever their clocks say",
+            ClockMode.CONTENT: "by which pictures and sound tell when each began",
+        }
+        return (f"{capture.offsets.name} is passed over for clock = '{clock}', {why[clock]}",)
+    moves = read_offsets(capture.offsets, capture.cameras)
+    period_ns = round(NANOSECONDS / median_low(info.rate for info in infos.values()))
+    return tuple(offset_notes(capture.offsets, moves, capture.cameras, period_ns))
+
+
+def load_timecodes(
+    capture: Capture, infos: Mapping[str, VideoInfo], clock: ClockMode | None = None
+) -> dict[str, Timecodes]:
     """Timecodes of every camera, numbered by the frames of its video, ready to align.
 
     They come from the timecode files, or from the containers if no camera has a file.
 
     Args:
         infos: what `probe_video` found, by camera.
+        clock: how the times are matched; None means as capture.toml says.
 
     Raises:
         ValueError: some cameras have timecode files and others have not (their times would not be comparable), a file
@@ -308,21 +338,37 @@ def load_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
     if not capture.timecodes:
         begun = {name: infos[name].begun_ns for name in told if not infos[name].start_label}
         told = {camera: codes.noting(*_begun_notes(camera, begun)) for camera, codes in told.items()}
-    return with_offsets(capture, told)
+    return with_offsets(capture, told, capture.settings.clock if clock is None else clock)
 
 
 def load_durations(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
-    """The same of cameras whose times tell only how long they have filmed: without what `time_offset_s` adds."""
+    """The same of cameras whose times tell only how long they have filmed: without what is added to them."""
     return _told_timecodes(capture, infos)
 
 
-def with_offsets(capture: Capture, timecodes: Mapping[str, Timecodes]) -> dict[str, Timecodes]:
-    """Timecodes with what `time_offset_s` in capture.toml adds to them."""
-    moves = capture.settings.time_offset_s
-    return {
-        camera: codes.moved(int(moves[camera] * NANOSECONDS)) if moves.get(camera) else codes
-        for camera, codes in timecodes.items()
-    }
+def with_offsets(capture: Capture, timecodes: Mapping[str, Timecodes], clock: ClockMode) -> dict[str, Timecodes]:
+    """Timecodes with what `offsets_of` adds to them; what capture.toml says is said by camera."""
+    said, read = capture.settings.time_offset_s, _read_offsets(capture, clock)
+    moved = dict(timecodes)
+    for camera, codes in timecodes.items():
+        if own := said.get(camera):
+            moved[camera] = codes.moved(int(own * NANOSECONDS))
+        if own := read.get(camera):
+            moved[camera] = moved[camera].moved(int(own * NANOSECONDS), told=False)
+    return moved
+
+
+def offsets_of(capture: Capture, clock: ClockMode) -> dict[str, Decimal]:
+    """Seconds to add to the times of cameras: `time_offset_s` of capture.toml and, where clocks are trusted,
+    t_offsets.json."""
+    said, read = dict(capture.settings.time_offset_s), _read_offsets(capture, clock)
+    return said | {camera: said.get(camera, Decimal(0)) + seconds for camera, seconds in read.items()}
+
+
+def _read_offsets(capture: Capture, clock: ClockMode) -> dict[str, Decimal]:
+    if capture.offsets is None or clock is not ClockMode.TRUSTED:
+        return {}
+    return read_offsets(capture.offsets, capture.cameras)
 
 
 def _told_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
@@ -655,6 +701,19 @@ def _check_names(path: Path, settings: CaptureSettings, videos: Mapping[str, Pat
         raise ValueError(f"{path}: {both} cannot be ignored and used as reference or held out")
 
 
+def _check_scale(path: Path, settings: CaptureSettings) -> None:
+    said = [key for key in ("board", "distance", "up") if getattr(settings, key)]
+    if said and settings.rig_from is not None:
+        raise ValueError(
+            f"{path}: {', '.join(said)} say how large a rig is, and where up is, but this one comes from rig_from; "
+            f"write them into the {SETTINGS} of that take"
+        )
+    if settings.up == "board" and settings.board is None:
+        raise ValueError(
+            f"{path}: up = 'board' needs a [board] that lies on the floor; describe it, or give up otherwise"
+        )
+
+
 def _checked(path: Path, key: str, value: Any) -> Any:
     """The value of a key in the form that `CaptureSettings` holds."""
     try:
@@ -669,6 +728,12 @@ def _checked(path: Path, key: str, value: Any) -> Any:
         raise ValueError(f"{path}: transfer must be one of {', '.join(TRANSFERS)}, but is {value!r}{close}")
     if key == "time_offset_s":
         return _checked_offsets(path, value)
+    if key == "board":
+        return _checked_tables(path, key, [value])[0]
+    if key == "distance":
+        return _checked_tables(path, key, value if isinstance(value, list) else [value])
+    if key == "up":
+        return _checked_up(path, value)
     many = key in ("tags", "held_out", "ignore")
     texts = value if many else [value]
     if not isinstance(texts, list) or not all(isinstance(text, str) and text for text in texts):
@@ -681,12 +746,34 @@ def _checked_offsets(path: Path, value: Any) -> dict[str, Decimal]:
         raise ValueError(f"{path}: time_offset_s must be a table of seconds by camera, but is {value!r}")
     for camera, seconds in value.items():
         number = isinstance(seconds, (int, Decimal)) and not isinstance(seconds, bool)
-        if not number or not Decimal(seconds).is_finite() or abs(seconds) > MOST_OFFSET_S:
+        if not number or not Decimal(seconds).is_finite() or not -MOST_OFFSET_S <= seconds <= MOST_OFFSET_S:
             raise ValueError(
                 f"{path}: time_offset_s of {camera!r} must be a number of seconds, at most {MOST_OFFSET_S} either "
                 f"way, but is {seconds!r}"
             )
     return {camera: Decimal(seconds) for camera, seconds in value.items()}
+
+
+def _checked_tables(path: Path, key: str, tables: list[Any]) -> tuple[dict[str, Any], ...]:
+    """With decimals as floats."""
+    if not tables or not all(isinstance(table, dict) for table in tables):
+        raise ValueError(f"{path}: {key} must be a table, but is {tables[0] if len(tables) == 1 else tables!r}")
+    return tuple(
+        {name: float(value) if isinstance(value, Decimal) else value for name, value in table.items()}
+        for table in tables
+    )
+
+
+def _checked_up(path: Path, value: Any) -> str | tuple[float, float, float]:
+    if isinstance(value, str) and value in UPWARD:
+        return value
+    numbers = value if isinstance(value, list) and len(value) == 3 else []
+    right = [isinstance(number, (int, Decimal)) and not isinstance(number, bool) for number in numbers]
+    x, y, z = map(float, numbers) if right and all(right) else (0.0, 0.0, 0.0)
+    if not 0 < x * x + y * y + z * z < float("inf"):
+        known = " or ".join(map(repr, UPWARD))
+        raise ValueError(f"{path}: up must be {known} or a direction [x, y, z] other than 0, but is {value!r}")
+    return x, y, z
 
 
 def _suggest(name: str, known: Iterable[str]) -> str:

@@ -105,7 +105,24 @@ def load_rig(path: Path, names: Sequence[str] | None = None, sizes: Mapping[str,
         reading = found.format.read(found.file, videos)
     if not reading.views:
         raise ValueError(f"{found.file} holds no posed pictures{' of these videos' if sizes else ''}")
-    return Rig(tuple(cameras_by_name(reading.views, names, found.file)), str(found.file), reading.metric)
+    cameras = tuple(cameras_by_name(reading.views, names, found.file))
+    return Rig(cameras, str(found.file), reading.metric, reading.up)
+
+
+def holds_lenses_alone(path: Path) -> bool:
+    """Whether a calibration is an intri.yml without an extri.yml: lenses that are known, of cameras to be placed."""
+    return easymocap.stands_alone(find_calibration(path).file)
+
+
+def load_lenses(path: Path, names: Sequence[str], sizes: Mapping[str, tuple[int, int]]) -> Rig:
+    """The lenses of `holds_lenses_alone`, those of all named cameras, at the size of their videos; all stand at 0.
+
+    Raises ValueError for an unreadable file and for videos without a lens.
+    """
+    found = find_calibration(path)
+    with about(found.file), np.errstate(all="ignore"):
+        reading = easymocap.read_lenses(found.file, Videos(tuple(names), sizes))
+    return Rig(tuple(cameras_by_name(reading.views, names, found.file)), str(found.file)).resized(sizes)
 
 
 def find_calibration(path: Path) -> Found:

@@ -44,6 +44,19 @@ def read(file: Path, videos: Videos) -> Reading:
         return Reading([view for view in found if view is not None])
 
 
+def read_lenses(file: Path, videos: Videos) -> Reading:
+    """The lenses of an intri.yml that has no extri.yml beside it; the poses mean nothing."""
+    with about(file):
+        lenses = _storage(file)
+        found = (_view(name, lenses, np.eye(4), videos) for name in _listed(lenses))
+        return Reading([view for view in found if view is not None])
+
+
+def stands_alone(file: Path) -> bool:
+    """Whether nothing says where these cameras stand."""
+    return claims(file) and not file.with_name(f"extri{file.suffix}").is_file()
+
+
 def _listed(lenses: Storage) -> list[str]:
     """The names that are listed, or, where none are, those of the matrices."""
     listed = lenses.get("names")

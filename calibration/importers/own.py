@@ -18,4 +18,4 @@ def claims(file: Path) -> bool:
 
 def read(file: Path, videos: Videos) -> Reading:
     rig = Rig.from_json(read_json(file), file)
-    return Reading([View((camera.name,), camera) for camera in rig.cameras], rig.metric)
+    return Reading([View((camera.name,), camera) for camera in rig.cameras], rig.metric, rig.up)

@@ -38,6 +38,8 @@ class Reading:
     views: Sequence[View]
     metric: bool = False
     """Whether its units are metres"""
+    up: tuple[float, float, float] | None = None
+    """Unit vector, world, where it says one"""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """How much view dependence is worth carrying, judged on fitted cameras that were left out so far.
 
 Bands above the constant one fit whatever differs between cameras, be it shine, or an error of calibration: the cameras
-that taught them cannot tell. Others can. Each degree is given the same iterations to make up for what it lacks, and is
-compared on cameras that took no part; from then on all cameras do.
+that taught them cannot tell. Others can. Each degree is given the same iterations, from the same Gaussians, and is
+compared on cameras that took no part; from then on all cameras do. Where too few film to leave any out, no band is
+carried.
 """
 
 from __future__ import annotations
@@ -26,9 +27,7 @@ LEAST_LEFT_OUT = 2
 LEAST_CAMERAS = 8
 """With fewer, those that are left have too little to tell shine from depth"""
 PASSES = 3
-"""Over the cameras that take part, in which a degree makes up for what it lacks, ..."""
-LEAST_SHARE = 0.02
-"""... or this share of all iterations, if that is more"""
+"""Over the cameras that take part, in which a degree shows what it can do, at least"""
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Judgement:
     """Chosen: the lowest that is nearly as good as all that were asked for"""
     asked: int
     cameras: tuple[str, ...]
-    """Left out and looked at; none: too few cameras, so those that were fitted are looked at"""
+    """Left out and looked at; none: too few cameras"""
     losses: Mapping[int, float]
     """By degree, photometric, of the cameras looked at"""
     psnr_db: Mapping[int, float]
@@ -68,10 +67,14 @@ class Judgement:
 def told(judgement: Mapping[str, Any]) -> str:
     """A judgement's `to_json`, in words."""
     cameras = judgement["left_out"]
-    who = f"cameras left out ({', '.join(cameras)})" if cameras else f"fitted cameras, fewer than {LEAST_CAMERAS}"
+    carried = f"degree {judgement['degree']} of {judgement['asked']} is carried: "
+    if not cameras:
+        return (
+            carried + f"fewer than {LEAST_CAMERAS} cameras film, so none can be left out to tell what bands are worth"
+        )
     return (
-        f"degree {judgement['degree']} of {judgement['asked']} is carried: all bands save {judgement['gain']:.1%} of "
-        f"the loss of {who}, {judgement['gain_db']:+.2f} dB"
+        carried + f"all bands save {judgement['gain']:.1%} of the loss of cameras left out ({', '.join(cameras)}), "
+        f"{judgement['gain_db']:+.2f} dB"
     )
 
 
@@ -101,26 +104,27 @@ def judge(
     shots: Sequence[Shot],
     judges: Sequence[int],
     degrees: Sequence[int],
-    cut: Callable[[Solver, int], None],
+    give: Callable[[Solver, int], None],
     *,
+    share: float,
     of: int,
     gain: float,
     options: PhotometricOptions,
 ) -> tuple[Judgement, Solver]:
-    """Which of the degrees, ascending, suffices; the last one is what the solver has. Also returns the solver of the
-    chosen one.
+    """Which of the degrees, ascending, suffices. Also returns a branch of the solver with that degree, which has gone
+    on by this share `of` all iterations.
 
-    `judges` are the shots that took no part; without any, those that did are looked at, and nothing is fitted again,
-    so that a band that helps is kept rather than lost. `cut` takes the bands above a degree from a solver.
+    `judges` are the shots that took no part; without any the lowest degree suffices, or none but the last if `gain` is
+    negative. `give` sets the degree of a solver.
     """
     looked_at = [shots[index] for index in judges] or shots
     part = [shot for index, shot in enumerate(shots) if index not in set(judges)]
-    count = max(PASSES * len(part), round(LEAST_SHARE * of)) if judges else 0
+    count = max(PASSES * len(part), round(share * of)) if judges else 0
     losses, psnr_db = dict[int, float](), dict[int, float]()
 
     def tried(degree: int) -> Solver:
         twin = solver.branch()
-        cut(twin, degree)
+        give(twin, degree)
         twin.run(part, count, of=of)
         losses[degree], psnr_db[degree] = _error(twin, looked_at, options)
         return twin
@@ -155,11 +159,6 @@ def _counted(shot: Shot) -> np.ndarray:
     if shot.tiles is not None:
         counted &= pixels_of_tiles(shot.tiles, shot.camera)
     return counted if counted.any() else np.ones(size, bool)
-
-
-def drop_bands(solver: Solver, degree: int) -> None:
-    """Take the bands above a degree from the table."""
-    solver.model.limit_sh(degree)
 
 
 def still_bands(solver: Solver, degree: int) -> None:

@@ -27,7 +27,7 @@ from packuv.camera import PinholeCamera
 from packuv.each import Each, as_bits, packed
 from packuv.files import open_npz, save_json, save_npz
 from packuv.fit.backdrop import Backdrop, joined
-from packuv.fit.bands import Judgement, drop_bands, judge, left_out, still_bands
+from packuv.fit.bands import Judgement, judge, left_out, still_bands
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
 from packuv.fit.shots import Shot, find_shots, halved, moving_rows
@@ -48,6 +48,10 @@ LEAST_KNOWN = 0.5
 """Share of the pictures that must be known to stand still for a backdrop"""
 FOREGROUND_GAIN = 0.01
 """Share of the loss that the bands of a keyframe's own Gaussians must gain; without, they cost nothing in the file"""
+FOREGROUND_JUDGED_BY = 0.02
+"""Share of a keyframe's iterations by which each degree shows what it can do"""
+JUDGED_FROM, JUDGED_BY = 0.3, 0.1
+"""Shares of the first fit's iterations: before bands are tried, without the cameras that judge, and for each degree"""
 DEAD_CODE = 1
 """Opacity codes up to this one decode below 1/255, which no renderer draws"""
 
@@ -155,7 +159,7 @@ def _fit_all(
     cameras, targets = [shot.camera for shot in shots], Each(lambda index: undone(shots[index]), len(shots))
     shell = sweep_shell(cameras, targets, bounds=bounds, options=options.shell) if options.shell.enabled else None
     start = first_gaussians(cameras, targets, bounds=bounds, surface=_surface(shell, points, options),
-                            options=options.start, sh_degree=options.sh_degree, seed=options.seed)  # fmt: skip
+                            options=options.start, sh_degree=0, seed=options.seed)  # fmt: skip
     model = Model(start)
     solver = Solver(model, bounds, options, rng)
     total, grow_from = options.iterations, len(model)
@@ -168,15 +172,17 @@ def _fit_all(
         depths = (shell.depths(camera, index, bounds.near) for index, camera in enumerate(cameras))
         shots = [replace(shot, depths=known) for shot, known in zip(shots, depths, strict=True)]
         del shell
-    part = [shot for index, shot in enumerate(shots) if index not in judges]
-    solver.run(part, floating - solver.done, of=total, grow_from=grow_from, ticks=ticks)
     judgement = None
     if options.sh_degree:
+        part = [shot for index, shot in enumerate(shots) if index not in judges]
+        solver.run(part, round(JUDGED_FROM * total) - coarse, of=total, grow_from=grow_from, ticks=ticks)
+        done = solver.done
         degrees = range(options.sh_degree + 1)
-        judgement, best = judge(solver, shots, judges, degrees, drop_bands, of=total, gain=options.sh_gain,
-                                options=options.photometric)  # fmt: skip
-        solver.merge(best)
-        del best
+        judgement, solver = judge(solver, shots, judges, degrees, Solver.give_bands, share=JUDGED_BY, of=total,
+                                  gain=options.sh_gain, options=options.photometric)  # fmt: skip
+        model = solver.model
+        ticks.advance(solver.done - done)
+    solver.run(shots, floating - solver.done, of=total, grow_from=grow_from, ticks=ticks)
     solver.keep(solver.worth_keeping())
     model.gaussians = with_canonical_axes(model.gaussians)
     model.forget_moments(np.arange(len(model)), ("log_scales", "quaternions"))  # their axes have traded places
@@ -253,8 +259,8 @@ def _judge_foreground(
     judges, count = left_out([shot.camera for shot in shots]), options.key_iterations
     part = [shot for index, shot in enumerate(shots) if index not in judges]
     solver.run(part, count // 2, of=count, grow_from=len(solver.model), ticks=ticks)
-    judgement, best = judge(solver, shots, judges, (0, degree), still_bands, of=count, gain=FOREGROUND_GAIN,
-                            options=options.photometric)  # fmt: skip
+    judgement, best = judge(solver, shots, judges, (0, degree), still_bands, share=FOREGROUND_JUDGED_BY, of=count,
+                            gain=FOREGROUND_GAIN, options=options.photometric)  # fmt: skip
     solver.merge(best)
     return judgement
 

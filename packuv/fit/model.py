@@ -72,12 +72,12 @@ class Model:
         self.gaussians = Gaussians(*merged)
         self.moments = {name: state.grown(len(born)) for name, state in self.moments.items()}
 
-    def limit_sh(self, degree: int) -> None:
-        """Forget the spherical harmonics above a degree."""
-        count = (degree + 1) ** 2
-        self.gaussians = replace(self.gaussians, sh=np.ascontiguousarray(self.gaussians.sh[:, :count]))
+    def give_sh(self, degree: int) -> None:
+        """Add the spherical harmonics up to a degree, all 0, to a model that has those of degree 0."""
+        bands = (degree + 1) ** 2 - 1
+        self.gaussians = replace(self.gaussians, sh=np.pad(self.gaussians.sh, ((0, 0), (0, bands), (0, 0))))
         state = self.moments["sh"]
-        first, second = (np.ascontiguousarray(moment[:, : 3 * count]) for moment in (state.first, state.second))
+        first, second = (np.pad(moment, ((0, 0), (0, 3 * bands))) for moment in (state.first, state.second))
         self.moments["sh"] = AdamState(first, second, state.steps)
 
     def overwrite(self, rows: np.ndarray, values: Gaussians) -> None:

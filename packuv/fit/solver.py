@@ -27,6 +27,9 @@ from packuv.raster import Arena, Gradients, RasterOptions, Rendering, gradients,
 _VOID = 16 / 255
 """A pixel whose channels are all below may show nothing: decoded black is not quite black"""
 
+_BARE = 0.25
+"""Share of all pixels that may show nothing from which on they do: the stage is black, or was masked"""
+
 _ROUND = 24
 """Iterations, at least, before a frame asks how it fares: few cameras are passed over several times"""
 
@@ -45,6 +48,11 @@ def mean_losses(losses: Sequence[Losses]) -> Losses:
     """Mean of each term over the iterations in which it applied."""
     names = dict.fromkeys(name for part in losses for name in part)
     return {name: float(np.mean([part[name] for part in losses if name in part])) for name in names}
+
+
+def _void(target: np.ndarray) -> np.ndarray:
+    """Where a picture, float32 [3, H, W], may show nothing, bool [H, W]."""
+    return np.asarray(target.max(axis=0) <= _VOID)
 
 
 class Solver:
@@ -78,6 +86,7 @@ class Solver:
         self._arena = Arena()
         self._guard = Guard(model, bounds)
         self._overflown = 0
+        self._bare: bool | None = None
         self.done = 0
 
     @property
@@ -104,6 +113,12 @@ class Solver:
         self.model.gaussians, self.model.moments = twin.model.gaussians, twin.model.moments
         self._options, self._drawn = twin._options, None
         self._guard.renew(self.model)
+
+    def give_bands(self, degree: int) -> None:
+        """Gaussians without view dependence may get as much from now on."""
+        self.model.give_sh(degree)
+        self._guard.renew(self.model)
+        self._drawn = None
 
     def hold_bands(self) -> None:
         """Rows that may change lose their view dependence, and get none."""
@@ -226,6 +241,9 @@ class Solver:
         opaque: bool = False,
     ) -> Losses:
         options, shot = self._options, shots[index].opened()
+        behind = None
+        if opaque:
+            shot, behind = self._before_colour(shot, self._is_bare(shots))
         raster = RasterOptions(near, device=options.device)
         rendering = render(
             self._decoded(),
@@ -236,7 +254,6 @@ class Solver:
             over=self.backdrop.layer(shot.camera, shot.tiles),
         )
         moving = self.rows & (rendering.visible > 0)
-        behind = self._behind(shot.target) if opaque else None
         colour = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
         picture = shot.response.shown(colour)
         found = pulls(
@@ -267,10 +284,24 @@ class Solver:
             d_alpha = (np.zeros_like(rendering.alpha) if d_alpha is None else d_alpha) - through
         return gradients(rendering, d_colour, d_depth, d_alpha, rows=self.rows)
 
-    def _behind(self, target: np.ndarray) -> np.ndarray:
-        """A colour at random behind all Gaussians, black where the target is, float32 [3, H, W]."""
-        colour = self._rng.random(3).astype(np.float32)
-        return np.asarray(colour[:, None, None] * (target.max(axis=0) > _VOID))
+    def _is_bare(self, shots: Sequence[Shot]) -> bool:
+        """Whether people and things stand before black, judged once."""
+        if self._bare is None:
+            self._bare = float(np.mean([_void(shot.target).mean() for shot in shots])) > _BARE
+        return self._bare
+
+    def _before_colour(self, shot: Shot, bare: bool) -> tuple[Shot, np.ndarray]:
+        """What to explain, and a colour at random behind all Gaussians, float32 [3, H, W].
+
+        Where the target is black nobody knows whether something is: black stays behind. On a bare stage nothing is
+        there: that colour is to be seen, or else black Gaussians fill the stage and hide from unseen cameras what is
+        on it.
+        """
+        void, colour = _void(shot.target), self._rng.random(3).astype(np.float32)[:, None, None]
+        if not bare:
+            return shot, np.asarray(colour * ~void)
+        behind = np.broadcast_to(colour, shot.target.shape).copy()
+        return replace(shot, source=np.where(void, shot.response.shown(behind), shot.target)), behind
 
     def _decoded(self) -> Gaussians:
         """What the renderer draws; only rows that may change are decoded again."""

@@ -37,6 +37,8 @@ LEVEL = 1 / 255
 ROUNDS = 5
 REACH = 1.5
 """Logarithms of ratios, on sRGB + 0.055, that are looked for: a factor of 36 on light, up or down"""
+MOST_DARK = 0.75
+"""Of all pixels that count, what may be darker than that before it is the light that went, and not what stood there"""
 _BINS, _FINE = 300, 16
 """Of the histogram whose top starts an estimate; of the errors', a grey level"""
 _CUT = 4.0
@@ -230,13 +232,22 @@ def _agreeing(codes, values, table, c, factor, most):
 
 @kernel(inner=True)
 def _most_frequent(codes, values, part, table, c):
-    """The ratio that most steady pixels are close to, and how many there are."""
-    bins, valid = np.zeros(_BINS + 4, np.int64), 0
+    """The ratio that most steady pixels are close to, and how many there are.
+
+    What is darker than `REACH` stood before black and has gone, unless next to all is dark.
+    """
+    bins, valid, all_of_them, dark = np.zeros(_BINS + 4, np.int64), 0, 0, 0
     for p in range(len(codes)):
-        if values[p, c] > 0 and part[p] < PARTS:
+        if values[p, c] > 0:
             place = np.log(table[codes[p, c]] / values[p, c]) / _f32(2 * REACH) + _f32(0.5)
-            bins[2 + min(max(int(place * _f32(_BINS)), 0), _BINS - 1)] += 1
-            valid += 1
+            all_of_them += 1
+            dark += place < 0
+            if part[p] < PARTS:
+                valid += 1
+                if place >= 0:
+                    bins[2 + min(int(place * _f32(_BINS)), _BINS - 1)] += 1
+    if dark > _f32(MOST_DARK) * all_of_them:
+        return _f32(np.exp(-REACH)), valid
     best, top = -1, 0
     for b in range(2, _BINS + 2):
         near = bins[b - 2] + 2 * bins[b - 1] + 3 * bins[b] + 2 * bins[b + 1] + bins[b + 2]

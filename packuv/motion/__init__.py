@@ -6,18 +6,22 @@ from packuv.motion.follow import Change, Follower
 from packuv.motion.keyframes import KeyframeOptions
 from packuv.motion.patches import Patches, PatchOptions, epochs, find_patches
 from packuv.motion.plate import Plate, compare_plate
-from packuv.motion.step import MotionOptions, changed_between, one_opencv_thread
+from packuv.motion.raft import Raft, RaftOptions
+from packuv.motion.step import MotionBackend, MotionOptions, changed_between, one_opencv_thread
 
 __all__ = [
     "BackgroundOptions",
     "Change",
     "Follower",
     "KeyframeOptions",
+    "MotionBackend",
     "MotionCache",
     "MotionOptions",
     "PatchOptions",
     "Patches",
     "Plate",
+    "Raft",
+    "RaftOptions",
     "Still",
     "changed_between",
     "compare_plate",

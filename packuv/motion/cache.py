@@ -13,7 +13,7 @@ import json
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,9 @@ import numpy as np
 from packuv.camera import PinholeCamera
 from packuv.files import load_npy, map_npy, save_json
 from packuv.footage import Views
+from packuv.motion.raft import Raft, steady
 from packuv.motion.step import (
+    MotionBackend,
     MotionOptions,
     Step,
     fitted_size,
@@ -54,19 +56,27 @@ def measure_motion(
     folder: Path,
     options: MotionOptions,
     *,
+    raft: Raft | None = None,
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> MotionCache:
     """Measure every step of every camera into `folder`, going on where an earlier call was cut off.
 
     A step leads from the last instant at which the camera has a picture to this one, so a dropped frame makes a longer
-    step. `progress` gets the picture count done and in all. Raises ValueError if the folder holds another measurement.
+    step. `progress` gets the picture count done and in all. Raises ValueError if the folder holds another measurement,
+    or `raft` is not what the backend says.
     """
-    _claim(folder, _recipe(views, options))
+    if (raft is not None) != (options.backend is MotionBackend.RAFT):
+        raise ValueError(f"raft must be given if and only if the backend is raft, but is {raft} with {options.backend}")
+    _claim(folder, _recipe(views, options, raft))
     count = len(views.cameras)
     tally = _Tally(len(views) * count, progress)
-    with one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
-        jobs = [pool.submit(_measure_camera, views, index, folder, options, tally) for index in range(count)]
+    with ExitStack() as stack:
+        stack.enter_context(one_opencv_thread())
+        if raft:
+            stack.enter_context(steady())
+        pool = stack.enter_context(ThreadPoolExecutor(workers))
+        jobs = [pool.submit(_measure_camera, views, index, folder, options, raft, tally) for index in range(count)]
         try:
             for job in as_completed(jobs):
                 job.result()
@@ -88,12 +98,16 @@ class _Tally:
             self._progress(self._done, self._total)
 
 
-def _measure_camera(views: Views, camera: int, folder: Path, options: MotionOptions, tally: _Tally) -> None:
+def _measure_camera(
+    views: Views, camera: int, folder: Path, options: MotionOptions, raft: Raft | None, tally: _Tally
+) -> None:
     with closing(_CameraFiles(folder, views.cameras[camera], len(views), options)) as files:
-        _measure_steps(views, camera, files, options, tally)
+        _measure_steps(views, camera, files, options, raft, tally)
 
 
-def _measure_steps(views: Views, camera: int, files: _CameraFiles, options: MotionOptions, tally: _Tally) -> None:
+def _measure_steps(
+    views: Views, camera: int, files: _CameraFiles, options: MotionOptions, raft: Raft | None, tally: _Tally
+) -> None:
     available = np.flatnonzero(views.frames[:, camera] >= 0)
     start = files.finished
     tally.add(start)
@@ -108,7 +122,7 @@ def _measure_steps(views: Views, camera: int, files: _CameraFiles, options: Moti
             if before is None:
                 files.skip(instant)
             else:
-                files.write(instant, previous, measure_step(before, after, options))
+                files.write(instant, previous, measure_step(before, after, options, raft))
             before, previous = after, instant
         tally.add(1)
     files.commit()
@@ -122,7 +136,7 @@ def _pixels(views: Views, camera: int, instant: int) -> np.ndarray:
     return pixels
 
 
-def _recipe(views: Views, options: MotionOptions) -> dict[str, Any]:
+def _recipe(views: Views, options: MotionOptions, raft: Raft | None) -> dict[str, Any]:
     """What a cache depends on, as JSON; videos by name and size, so that a capture may be moved."""
     spec = views.to_spec()
     paths = {name: Path(path) for name, path in spec["videos"].items()}
@@ -133,6 +147,7 @@ def _recipe(views: Views, options: MotionOptions) -> dict[str, Any]:
         "cameras": [{"name": c.name, "width": c.width, "height": c.height} for c in views.cameras],
         "instants": len(views),
         "views": hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest(),
+        **({"raft": dict(raft.facts)} if raft else {}),
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,6 +20,9 @@ class MotionBackend(StrEnum):
 
     DIS = "dis"
     """OpenCV's dense inverse search, on the CPU"""
+    RAFT = "raft"
+    """A network with weights of the user's, see `packuv.motion.raft`; a hundred times slower on the CPU. It estimates
+    what the cache keeps; where two pictures are only compared, DIS says which outlines are filled"""
 
 
 class DisPreset(StrEnum):
@@ -84,6 +87,10 @@ class MotionOptions:
             raise ValueError("closing_px, dilation_px and least_area_px must not be negative, blur_px positive")
 
 
+Estimator = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Optical flow, float32 [h, w, 2], pixels, of two grey pictures, uint8 [h, w] each"""
+
+
 @dataclass(frozen=True)
 class Step:
     """Motion from one picture of a camera to a later one."""
@@ -98,14 +105,16 @@ class Step:
     """Standard deviation of the blurred difference where nothing moves, grey values"""
 
 
-def measure_step(before: np.ndarray, after: np.ndarray, options: MotionOptions) -> Step:
-    """Motion between two grey pictures of one camera, uint8 [H, W] each."""
+def measure_step(
+    before: np.ndarray, after: np.ndarray, options: MotionOptions, estimator: Estimator | None = None
+) -> Step:
+    """Motion between two grey pictures of one camera, uint8 [H, W] each; by DIS where no other estimator is given."""
     if before.shape != after.shape or before.ndim != 2 or before.dtype != np.uint8 or after.dtype != np.uint8:
         raise ValueError(
             f"motion needs two grey uint8 pictures of one size, but has {before.dtype} {before.shape} "
             f"and {after.dtype} {after.shape}"
         )
-    vectors = optical_flow(before, after, options)
+    vectors = optical_flow(before, after, options, estimator)
     size = fitted_size(before.shape[1], before.shape[0], options.width)
     speed = cv2.resize(np.hypot(vectors[..., 0], vectors[..., 1]), size)  # [hm, wm]
     mask, noise = changed(_shrunk(before, size), _shrunk(after, size), options)
@@ -116,19 +125,26 @@ def measure_step(before: np.ndarray, after: np.ndarray, options: MotionOptions) 
     return Step(vectors, mask, float((speed * mask).mean()), noise)
 
 
-def optical_flow(before: np.ndarray, after: np.ndarray, options: MotionOptions) -> np.ndarray:
+def optical_flow(
+    before: np.ndarray, after: np.ndarray, options: MotionOptions, estimator: Estimator | None = None
+) -> np.ndarray:
     """Optical flow from `before` to `after`, uint8 [H, W] each: float32 [h, w, 2], in pixels of the given pictures."""
     height, width = before.shape
     size = fitted_size(width, height, min(options.flow_width, options.width))
+    estimate = estimator or dis(options.preset)
+    vectors = estimate(_shrunk(before, size), _shrunk(after, size))
+    return vectors * np.array([width / size[0], height / size[1]], dtype=np.float32)
+
+
+def dis(preset: DisPreset) -> Estimator:
+    """OpenCV's dense inverse search."""
     presets = {
         DisPreset.ULTRAFAST: cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
         DisPreset.FAST: cv2.DISOPTICAL_FLOW_PRESET_FAST,
         DisPreset.MEDIUM: cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
     }
-    engine = cv2.DISOpticalFlow.create(presets[options.preset])
-    empty = np.zeros((size[1], size[0], 2), dtype=np.float32)
-    vectors = np.asarray(engine.calc(_shrunk(before, size), _shrunk(after, size), empty))
-    return vectors * np.array([width / size[0], height / size[1]], dtype=np.float32)
+    engine = cv2.DISOpticalFlow.create(presets[preset])
+    return lambda before, after: np.asarray(engine.calc(before, after, np.zeros((*before.shape, 2), np.float32)))
 
 
 def changed(before: np.ndarray, after: np.ndarray, options: MotionOptions) -> tuple[np.ndarray, float]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
@@ -31,6 +32,8 @@ KEY, DYNAMIC = 0, 1
 TRACK_NAMES = ("key", "dynamic")
 FLAG_NAMES = ("kept", "changed")
 """Names of the tracks' planes of flags."""
+COMPRESSION = "compression"
+"""Name of what `extra` says of a scene whose codes are coarser than those of the lossless one that it was made from"""
 LIGHT_STEPS = 100_000
 """Light is stored in steps of 1 / LIGHT_STEPS, a thousandth of a percent"""
 
@@ -71,6 +74,7 @@ class SceneHeader:
         near = self.extra.get("near")
         if near is not None:
             bounds.positive(near, "the scene's near plane, extra.near,")
+        _ = self.up
         try:
             json.dumps([dict(self.sync), dict(self.extra)], allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -92,6 +96,17 @@ class SceneHeader:
     def near(self) -> float:
         """Depth before which nothing is drawn, world; raises ValueError where the scene does not say."""
         return float(field_of(self.extra, "near", "the scene's header: extra"))
+
+    @property
+    def up(self) -> tuple[float, float, float] | None:
+        """Where up is, world, a unit vector; None where the scene does not say."""
+        given = self.extra.get("up")
+        if given is None:
+            return None
+        x, y, z = bounds.numbers(given, "the scene's up, extra.up,", (3,)).tolist()
+        if not 0.99 < math.hypot(x, y, z) < 1.01:
+            raise ValueError(f"the scene's up, extra.up, must be a unit vector, but is {bounds.shown(given)}")
+        return x, y, z
 
     def first(self, frames: int) -> SceneHeader:
         """The header of a scene that ends after so many frames."""

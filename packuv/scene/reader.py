@@ -11,8 +11,9 @@ import numpy as np
 
 from packuv.gaussians.codes import Codes
 from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.segment import Segment
 from packuv.scene.encoder import worker_count
-from packuv.scene.header import DYNAMIC, KEY, SceneHeader, SceneIndex
+from packuv.scene.header import COMPRESSION, DYNAMIC, KEY, SceneHeader, SceneIndex
 from packuv.scene.lookahead import Address, LookAhead
 from packuv.scene.matroska import Reader
 from packuv.scene.sharing import assemble
@@ -67,6 +68,11 @@ class Scene:
     def header(self) -> SceneHeader:
         return self.index.header
 
+    @property
+    def lossless(self) -> bool:
+        """Whether its codes are those that were fitted."""
+        return self.index.tolerance.exact and COMPRESSION not in self.header.extra
+
     def __len__(self) -> int:
         """Number of frames."""
         return len(self.index.digests)
@@ -103,6 +109,19 @@ class Scene:
         shown = self.header.quantizer.decode(codes)
         self._shown = shown, self._segment
         return shown
+
+    def segment(self, number: int) -> Segment:
+        """All frames of a segment, its rows in stored order. Raises IndexError outside the scene."""
+        if not 0 <= number < len(self.index.segments):
+            raise IndexError(f"segment {number} of a scene with {len(self.index.segments)}")
+        entry = self.index.segments[number]
+        key, moving = self.codes(entry.first), slice(0, entry.dynamic)
+        xyz = np.empty((entry.frames - 1, entry.dynamic, 3), np.uint16)
+        attributes = np.empty((entry.frames - 1, entry.dynamic, key.attributes.shape[1]), np.uint8)
+        for step in range(1, entry.frames):
+            codes = self._seek(entry.first + step)
+            xyz[step - 1], attributes[step - 1] = codes.xyz[moving], codes.attributes[moving]
+        return Segment(entry.first, key, np.arange(entry.rows) < entry.dynamic, xyz, attributes)
 
     def light(self, frame: int) -> np.ndarray:
         """Light of a frame, float64 [3]: natural logarithms of factors on linear light, r g b; 0 is steady.

@@ -208,14 +208,15 @@ function between(a, b, t) {
   };
 }
 
-// Where the capture happens, judged by its cameras: the point nearest all gazes, the mean up, the typical distance.
+// Where the capture happens, judged by its cameras: the point nearest all gazes, the mean up unless the scene says where
+// up is, the typical distance.
 export function worldOf(scene) {
   const { cameras, centre, near } = scene;
-  if (!cameras.length) return { centre, up: [0, 0, 1], radius: 1, near };
+  if (!cameras.length) return { centre, up: scene.up ?? [0, 0, 1], radius: 1, near };
   const axes = cameras.map(({ camera_from_world: m }) => m.slice(0, 3).map((row) => row.slice(0, 3)));
   const eyes = cameras.map(({ camera_from_world: m }, c) =>
     [0, 1, 2].map((k) => -(axes[c][0][k] * m[0][3] + axes[c][1][k] * m[1][3] + axes[c][2][k] * m[2][3])));
-  const up = unit(axes.reduce((sum, axis) => add(sum, axis[1], -1), [0, 0, 0]));
+  const up = scene.up ?? unit(axes.reduce((sum, axis) => add(sum, axis[1], -1), [0, 0, 0]));
   const middle = meeting(eyes, axes.map((axis) => axis[2])) ?? centre;
   const spans = eyes.map((eye) => Math.hypot(...add(eye, middle, -1))).sort((a, b) => a - b);
   return { centre: middle, up, radius: spans[spans.length >> 1] || 1, near };

@@ -69,6 +69,10 @@ class Source(Protocol):
         """Depth before which renders of this scene draw nothing, world; None to derive it from the cameras."""
 
     @property
+    def up(self) -> tuple[float, float, float] | None:
+        """Where up is, world, a unit vector; None to derive it from the cameras."""
+
+    @property
     def segments(self) -> tuple[range, ...]:
         """Frames of each segment without a gap; the first of each is its keyframe."""
 
@@ -93,6 +97,7 @@ class SegmentSource:
     name: str = "segments"
     held_out: frozenset[str] = field(default=frozenset())
     near: float | None = None
+    up: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.parts:
@@ -139,6 +144,7 @@ class SceneSource:
         self.light = header.light
         self.quantizer, self.cameras, self.held_out = header.quantizer, header.cameras, frozenset(header.held_out)
         self.near: float | None = header.extra.get("near")
+        self.up = header.up
         self.segments = tuple(range(entry.first, entry.first + entry.frames) for entry in scene.index.segments)
         self._keys: OrderedDict[int, Codes] = OrderedDict()
         self._moving: OrderedDict[int, Codes] = OrderedDict()
@@ -207,6 +213,7 @@ def describe(source: Source) -> dict[str, Any]:
         "segments": [{"first": frames.start, "length": len(frames)} for frames in source.segments],
         "cameras": [{**camera.to_json(), "held_out": camera.name in source.held_out} for camera in source.cameras],
         **({"light": source.light.tolist()} if source.light.any() else {}),
+        **({"up": list(source.up)} if source.up else {}),
     }
 
 

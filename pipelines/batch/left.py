@@ -8,14 +8,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipelines.events import Event
 from pipelines.process import Outcome
 from pipelines.request import BAD_INPUT
+from pipelines.results import event_of
 from tasks.artefacts.recipe import restore
 from tasks.artefacts.retention import RUN
-from tasks.artefacts.store import Key
 from tasks.report.facts import Choice
 from tasks.report.findings import Finding
+from tasks.report.verdict import Verdict
 from tasks.report.write import JSON_NAME, PAGE_NAME
 from tasks.stages.encode import SCENE
 
@@ -40,8 +40,9 @@ def outcome_left(folder: Path, run: Mapping[str, Any]) -> Outcome:
         scene=folder / SCENE if report["scene"] else None,
         report=folder / PAGE_NAME,
         figures=report["summary"],
-        events=tuple(_event(stage) for stage in run["stages"]),
+        events=tuple(event_of(stage) for stage in run["stages"]),
         findings=restore(tuple[Finding, ...], report["findings"]),
+        verdict=restore(Verdict | None, report.get("verdict")),
         choice=restore(Choice | None, report["run"]["choice"]),
     )
 
@@ -56,9 +57,3 @@ def error_left(run: Mapping[str, Any] | None, message: str) -> Exception:
 
 def _kinds(kind: type[BaseException]) -> set[type[BaseException]]:
     return {kind, *(inner for one in kind.__subclasses__() for inner in _kinds(one))}
-
-
-def _event(stage: Mapping[str, Any]) -> Event:
-    kind, _, digest = stage.get("artefact", "").partition("/")
-    key = Key(kind, digest, reused=stage["outcome"] == "reused") if digest else None
-    return Event(stage["stage"], stage["outcome"], stage["seconds"], key, stage.get("reason", ""))

@@ -76,10 +76,11 @@ def run(request: RunRequest, journal: Journal, *, direct: bool) -> Outcome:
     with workflow_server(Path(request.out)) as server:
         journal.started("workflow engine")
         from pipelines.link import Link
-        from pipelines.options import compose  # takes seconds, in which the server starts
+        from pipelines.options import check_raft, compose  # takes seconds, in which the server starts
         from pipelines.sequence import log_to_the_server_only, run_flow
 
-        compose(request.preset, CaptureSettings(), request.settings)  # a misspelt setting need not wait for the server
+        # A misspelt setting, or a missing file of weights, need not wait for the server.
+        check_raft(compose(request.preset, CaptureSettings(), request.settings))
         server.wait_ready()
         journal.ended("workflow engine")
         journal.told("dashboard", server.dashboard)

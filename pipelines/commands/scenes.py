@@ -59,7 +59,8 @@ def info(arguments: argparse.Namespace) -> int:
             "bytes_per_frame": size / len(scene),
             "sh_degree": header.quantizer.sh_degree,
             "light": _light_range(header.light),
-            "lossless": index.tolerance.exact,
+            "lossless": scene.lossless,
+            "compression": _compression(header.extra, size),
             "tolerance": vars(index.tolerance),
             "cameras": [camera.name for camera in header.cameras],
             "held_out": list(header.held_out),
@@ -75,6 +76,20 @@ def info(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _compression(extra: Mapping[str, Any], size: int) -> dict[str, float] | None:
+    """What a compressed scene says of itself; None for one that is as it was fitted."""
+    from packuv.bounds import field, fields, finite
+    from packuv.scene.header import COMPRESSION
+
+    if COMPRESSION not in extra:
+        return None
+    what = f"the scene's header: extra: {COMPRESSION}"
+    said = fields(extra[COMPRESSION], what)
+    names = ("source_bytes", "psnr_db", "loss_db", "fitted_db")
+    known = {name: finite(field(said, name, what), f"{what}: {name}") for name in names}
+    return {**known, "ratio": known["source_bytes"] / size}
+
+
 def _light_range(light: np.ndarray) -> list[float] | None:
     """Least and most of any channel, as factors on linear light; None where it is steady."""
     return [math.exp(light.min()), math.exp(light.max())] if light.any() else None
@@ -87,6 +102,11 @@ def _info_text(facts: Mapping[str, Any]) -> str:
     within = "within {position} steps of a position and {attribute} of any other code, of what was fitted"
     lights = ["light      {:.1%} to {:.1%} of steady light".format(*facts["light"])] if facts["light"] else []
     exact = "exactly as fitted" if facts["lossless"] else within.format(**facts["tolerance"])
+    if made := facts["compression"]:
+        exact = (
+            "lossy, {ratio:.2f} times smaller than the lossless scene; pictures {psnr_db:.2f} dB to its, a loss of "
+            "{loss_db:.3f} dB where it has {fitted_db:.2f} dB against footage"
+        ).format(**made)
     return "\n".join(
         [
             f"{facts['file']}: {size_text(facts['bytes'])}, {size_text(facts['bytes_per_frame'])} a frame",

@@ -39,6 +39,8 @@ class Line:
     finished: str = ""
     """UTC, ISO 8601"""
     reason: str = ""
+    verdict: str = ""
+    """Of its report, one sentence"""
     report: str | None = None
     """Path, relative to the page"""
     scene: str | None = None

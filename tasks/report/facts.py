@@ -58,6 +58,18 @@ class StageRecord:
 
 
 @dataclass(frozen=True)
+class CameraEvidence:
+    """What pictures say of a camera's pose and gain."""
+
+    points: int | None = None
+    """Triangulated points that it saw, or, held out, by which its gain was measured"""
+    error_px: float | None = None
+    """Median distance between where it saw them and where the rig puts them, pixels; None for a held-out camera"""
+    gain: str = ""
+    """Whether its gain was measured, and what by"""
+
+
+@dataclass(frozen=True)
 class LastingChange:
     """Something changes for good: from this frame on another backdrop stands behind what moves."""
 
@@ -274,6 +286,8 @@ class ReportInput:
     held_out: tuple[str, ...] = ()
     """Cameras that were never fitted"""
     check: RigReport | None = None
+    evidence: Mapping[str, CameraEvidence] = field(default_factory=dict)
+    """By camera; empty where no points were triangulated"""
     content: Content | None = None
     footage: tuple[str, ...] = ()
     """What was read of the videos and what was not, where it is not plain, and which pictures are damaged"""
@@ -337,12 +351,18 @@ def by_camera(scores: Sequence[FrameScore]) -> dict[str, list[FrameScore]]:
 
 
 def mean_by_frame(scores: Sequence[FrameScore], name: str = "psnr_db") -> dict[int, float]:
-    """Mean ratio of the cameras that have it at each frame, dB, in order of frames."""
-    frames: dict[int, list[FrameScore]] = {}
+    """Mean of a figure over the cameras at each frame that has it, in order of frames.
+
+    A camera without a picture at a frame counts there as by its own mean and how the others do, so that a frame is not
+    good or bad for who filmed it.
+    """
+    own = {camera: known for camera, items in by_camera(scores).items() if (known := mean_of(items, name)) is not None}
+    usual = float(np.mean(list(own.values()))) if own else 0.0
+    away: dict[int, list[float]] = {}
     for score in sorted(scores, key=lambda item: item.frame):
-        frames.setdefault(score.frame, []).append(score)
-    means = {frame: mean_of(own, name) for frame, own in frames.items()}
-    return {frame: level for frame, level in means.items() if level is not None}
+        if (level := mean_of([score], name)) is not None:
+            away.setdefault(score.frame, []).append(level - own[score.camera])
+    return {frame: usual + float(np.mean(levels)) for frame, levels in away.items()}
 
 
 LEVELS = {

@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from tasks.report.facts import SIZE_FRAMES, ReportInput
-from tasks.report.findings import LIMITS, Limits, findings
-from tasks.report.record import summary
+from tasks.report.facts import SIZE_FRAMES, ReportInput, StageOutcome
+from tasks.report.findings import findings
+from tasks.report.limits import LIMITS, Limits
 from tasks.report.sections import SECTIONS, sections
+from tasks.report.summary import summary
+from tasks.report.verdict import verdict
 
 __all__ = ["SECTIONS", "duration", "page_text"]
 
@@ -32,6 +34,7 @@ def page_text(report: ReportInput, limits: Limits = LIMITS) -> str:
             name=report.name,
             subtitle=_subtitle(report),
             cards=_cards(report),
+            verdict=verdict(report, limits, found),
             findings=found,
             most_findings=MOST_FINDINGS,
             measured=any((report.sync, report.rig, report.scores, report.scene)),
@@ -75,11 +78,14 @@ def _cards(report: ReportInput) -> list[Card]:
     scored = f"{'held-out' if held else 'fitted'} cameras, mean"
     verified = {None: ("not checked", ""), True: ("exact", "good"), False: ("DAMAGED", "bad")}[figures["verified"]]
     peak = figures["peak_memory_bytes"]
+    reused = sum(stage.outcome is StageOutcome.REUSED for stage in report.stages)
+    ran = sum(stage.outcome is not StageOutcome.SKIPPED for stage in report.stages)
+    there = f" of the last run, {reused} of {ran} stages were there" if reused else ""
     return [
         Card(_number(figures["psnr_db"], "{:.2f} dB"), f"PSNR, {scored}"),
         Card(_number(figures["ssim"], "{:.3f}"), f"SSIM, {scored}"),
         Card(_number(figures["mb_per_30_frames"], "{:.2f} MB"), f"per {SIZE_FRAMES} frames, whole file"),
-        Card(duration(figures["seconds"]), f"total time{f', peak {peak / 1e9:.1f} GB' if peak else ''}"),
+        Card(duration(figures["seconds"]), f"total time{there}{f', peak {peak / 1e9:.1f} GB' if peak else ''}"),
         Card(_number(figures["frames"], "{}"), f"frames at {float(scene.rate):g} fps" if scene else "frames"),
         Card(_number(total, "{}"), f"cameras, {held} held out"),
         Card(verified[0], "decoded and compared", verified[1]),

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -168,10 +169,15 @@ class Volume:
 
 
 def rig_views(
-    cameras: Sequence[Camera], *, held_out: Sequence[str], volume: Volume | None, unit: str
+    cameras: Sequence[Camera],
+    *,
+    held_out: Sequence[str],
+    volume: Volume | None,
+    unit: str,
+    up: Sequence[float] | None = None,
 ) -> tuple[Markup, Markup]:
-    """The rig from above and from the side, at one scale. Up is the mean of the cameras' own up."""
-    axes = np.stack(rig_axes(cameras))  # [3, 3]: across, away, up
+    """The rig from above and from the side, at one scale. Up is the mean of the cameras' own, unless `up` is given."""
+    axes = np.stack(rig_axes(cameras, up))  # [3, 3]: across, away, up
     spots = np.array([camera.centre for camera in cameras]) @ axes.T
     if volume:
         middle = axes @ volume.centre
@@ -186,9 +192,35 @@ def rig_views(
     return above, side
 
 
-def rig_axes(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rig_model(
+    cameras: Sequence[Camera],
+    *,
+    held_out: Sequence[str],
+    volume: Volume | None,
+    up: Sequence[float] | None = None,
+) -> dict[str, Any]:
+    """What page.js turns about: points along across, away and up of `rig_axes`, about their middle, in units of their
+    reach. Each camera has its tip and the four corners of its picture."""
+    axes = np.stack(rig_axes(cameras, up))
+    tips = np.array([camera.centre for camera in cameras]) @ axes.T
+    middle = axes @ volume.centre if volume else tips.mean(axis=0)
+    reach = max(float(np.linalg.norm(tips - middle, axis=1).max()), volume.radius if volume else 0, 1e-9)
+    shown = []
+    for camera, tip in zip(cameras, tips, strict=True):
+        corners = [(x, y) for x, y in ((0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height))]
+        rays = np.array([((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0) for x, y in corners])
+        ends = tip + 0.16 * reach * rays @ camera.camera_from_world[:3, :3] @ axes.T
+        points = (np.concatenate([tip[None], ends]) - middle) / reach
+        shown.append({"name": camera.name, "held": camera.name in held_out, "points": points.round(4).tolist()})
+    return {"cameras": shown, "volume": round(volume.radius / reach, 4) if volume else 0}
+
+
+def rig_axes(
+    cameras: Sequence[Camera], known_up: Sequence[float] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit vectors, world: the rig's widest horizontal direction, the one to its left, and up; right-handed."""
     up = -np.sum([camera.camera_from_world[1, :3] for camera in cameras], axis=0)
+    up = up if known_up is None else np.asarray(known_up, dtype=np.float64)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
     centres = np.array([camera.centre for camera in cameras])
     level = centres - centres.mean(axis=0)

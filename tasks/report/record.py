@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,11 +15,11 @@ from tasks.report.facts import (
     FrameScore,
     ReportInput,
     SceneFigures,
-    by_camera,
-    mean_of,
-    still_trend,
 )
-from tasks.report.findings import LIMITS, Limits, findings
+from tasks.report.findings import findings
+from tasks.report.limits import LIMITS, Limits
+from tasks.report.summary import summary
+from tasks.report.verdict import verdict
 
 SCHEMA = 1
 """Version of report.json"""
@@ -31,7 +30,7 @@ MOST_FRAMES = 5000
 def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
     """The numbers of the report, without its pictures; docs/viewer.md names the fields. Of a long scene, lists by frame
     hold every so manieth frame."""
-    every = -(-_frames(report) // MOST_FRAMES) or 1
+    every, found = -(-_frames(report) // MOST_FRAMES) or 1, findings(report, limits)
     return {
         "schema": SCHEMA,
         "name": report.name,
@@ -47,10 +46,13 @@ def report_json(report: ReportInput, limits: Limits = LIMITS) -> dict[str, Any]:
         },
         "every": every,
         "summary": summary(report),
-        "findings": [plain(finding) for finding in findings(report, limits)],
+        "verdict": plain(verdict(report, limits, found)),
+        "limits": plain(limits),
+        "findings": [plain(finding) for finding in found],
         "sync": report.sync and report.sync.to_json(),
         "content": report.content and plain(report.content),
         "cameras": _cameras_json(report),
+        "evidence": {name: plain(own) for name, own in report.evidence.items()},
         "check": report.check and report.check.to_json(),
         "light": report.light
         and {
@@ -88,36 +90,6 @@ def _scene_json(scene: SceneFigures, every: int) -> dict[str, Any]:
 def _score_json(score: FrameScore) -> dict[str, Any]:
     levels = {name: min(value, MAX_PSNR_DB) for name in LEVELS if (value := getattr(score, name)) is not None}
     return {**vars(score), **levels}
-
-
-def summary(report: ReportInput) -> dict[str, Any]:
-    """The figures that one quotes; None where there is none. Means run over cameras first, then over frames."""
-    cameras = by_camera(report.scores)
-    scene, rig = report.scene, report.rig
-    work = sum(stage.seconds for stage in report.stages) if report.stages else None
-    return {
-        "psnr_db": _mean([np.mean([score.level_db for score in own]) for own in cameras.values()]),
-        "ssim": _mean([np.mean([score.ssim for score in own]) for own in cameras.values()]),
-        **{f"psnr_{name}": _over_cameras(cameras, name) for name in LEVELS if name != "psnr_db"},
-        "still_trend_db": still_trend(report.scores),
-        **{name: _over_cameras(cameras, name) for name in ("tof_px", "flicker", "lpips")},
-        "scored_cameras": sorted(cameras),
-        "mb_per_30_frames": scene.mb_per_30_frames if scene else None,
-        "seconds": report.seconds if report.seconds is not None else work,
-        "peak_memory_bytes": max((s.peak_memory_bytes or 0 for s in report.stages), default=0) or None,
-        "frames": scene.frames if scene else None,
-        "cameras": len(rig.cameras) if rig else len(report.sync.cameras) if report.sync else None,
-        "held_out": list(report.held_out),
-        "verified": scene.verified if scene else None,
-    }
-
-
-def _over_cameras(cameras: Mapping[str, Sequence[FrameScore]], name: str) -> float | None:
-    return _mean([value for own in cameras.values() if (value := mean_of(own, name)) is not None])
-
-
-def _mean(values: Sequence[Any]) -> float | None:
-    return float(np.mean(values)) if len(values) else None
 
 
 def _cameras_json(report: ReportInput) -> list[dict[str, Any]]:

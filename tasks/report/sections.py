@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 from markupsafe import Markup
@@ -26,7 +27,8 @@ from tasks.report.facts import (
     mean_of,
     still_trend,
 )
-from tasks.report.findings import Finding, Limits, corner_light
+from tasks.report.findings import Finding, corner_light
+from tasks.report.limits import Limits
 from tasks.report.pictures import DIFFERENCE_GAIN, comparison
 from tasks.report.plots import (
     MOST_BARS,
@@ -36,14 +38,18 @@ from tasks.report.plots import (
     bar_chart,
     gain_chart,
     line_chart,
+    rig_model,
     rig_views,
     sparkline,
 )
+from tasks.report.summary import summary
 
 MANY_LINES = 6
 """With more cameras than this, only the worst and the mean are named"""
 MANY_STAGES, WORST_STAGES = 24, 6
 """Of more stages that are alike than the first, so many have a row, and one row sums up the rest"""
+VIEWER = "http://127.0.0.1:8787"
+"""Where `packuv view` shows a scene unless it is told otherwise"""
 BAR_PX = 220
 """The longest stage's bar"""
 
@@ -74,7 +80,7 @@ class Section:
 
     name: str
     title: str
-    findings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     view: View = field(default_factory=dict)
     missing: str = ""
     """Why there is nothing to show"""
@@ -100,7 +106,7 @@ def sections(report: ReportInput, found: Sequence[Finding], limits: Limits) -> l
 
 
 def _section(name: str, body: Body, found: Sequence[Finding]) -> Section:
-    own = tuple(item.text for item in found if item.section == name)
+    own = tuple(item for item in found if item.section == name)
     if isinstance(body, str):
         return Section(name, SECTIONS[name], own, missing=body)
     return Section(name, SECTIONS[name], own, body)
@@ -159,13 +165,15 @@ def _rig(report: ReportInput) -> Body:
     check, rig = report.check, report.rig
     unit = "m" if rig.metric else "units"
     volume = Volume(check.scene_centre, check.common_radius) if check else None
-    above, side = rig_views(rig.cameras, held_out=report.held_out, volume=volume, unit=unit)
+    above, side = rig_views(rig.cameras, held_out=report.held_out, volume=volume, unit=unit, up=rig.up)
     return {
         "source": rig.source,
         "unit": unit,
         "metric": rig.metric,
         "volume": check,
         "above": above,
+        "model": rig_model(rig.cameras, held_out=report.held_out, volume=volume, up=rig.up),
+        "evidence": list(report.evidence.items()),
         "side": side,
     }
 
@@ -249,6 +257,8 @@ def _quality(report: ReportInput, limits: Limits) -> Body:
     low = float(np.median(list(level.values()))) - limits.camera_drop_db
     return {
         "held_out": bool(report.held_out),
+        "worst": _worst(report),
+        "flicker": _flicker(report),
         "levels": line_chart(
             _level_lines(report, cameras, level),
             title="PSNR over time",
@@ -262,6 +272,29 @@ def _quality(report: ReportInput, limits: Limits) -> Body:
         "areas": _areas(report),
         "trend_db": still_trend(report.scores),
     }
+
+
+def _worst(report: ReportInput) -> View:
+    """The frame with the lowest mean, where in it, and where the viewer shows it."""
+    means = mean_by_frame(report.scores)
+    frame = min(means, key=lambda item: means[item])
+    own = [score for score in report.scores if score.frame == frame]
+    camera = min(own, key=lambda score: score.level_db).camera
+    place = urlencode({"frame": frame, "camera": camera, "play": 0})
+    scene = report.scene.name if report.scene else ""
+    return {"frame": frame, "camera": camera, "mean_db": means[frame], "url": f"{VIEWER}/#{place}", "scene": scene}
+
+
+def _flicker(report: ReportInput) -> Markup | None:
+    """What blinks in renders alone, over time, mean over the cameras."""
+    means = mean_by_frame(report.scores, "flicker")
+    if not means:
+        return None
+    line = Series("flicker", list(means), list(means.values()), "s4")
+    marks = report.motion.keyframes if report.motion else ()
+    return line_chart(
+        [line], title="Flicker", x_label="frame", y_label="flicker", marks=marks, from_zero=True, height=180
+    )
 
 
 def _areas(report: ReportInput) -> Markup | None:
@@ -368,7 +401,7 @@ def _stages(report: ReportInput) -> Body:
     longest = max(stage.seconds for stage in ran) or 1
     shown, rest = told_apart(ran, lambda stage: (stage.outcome is StageOutcome.FAILED, stage.seconds))
     return {
-        "seconds": sum(stage.seconds for stage in ran),
+        "total": summary(report)["seconds"],
         "stages": [_stage_row(stage, longest) for stage in shown],
         "rest": [_rest_row(kind, stages) for kind, stages in rest.items()],
         "forecast": report.forecast,

@@ -19,7 +19,8 @@ from tasks.report.facts import (
     frames_to_picture,
     scene_figures,
 )
-from tasks.report.findings import LIMITS, Finding, Limits, findings
+from tasks.report.findings import Finding, findings
+from tasks.report.limits import LIMITS, Limits
 from tasks.report.page import page_text
 from tasks.report.record import report_json
 

@@ -13,8 +13,9 @@ import numpy as np
 from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
 from calibration.colour import BalanceOptions, ColourReport, balance, with_colours
 from calibration.held_out import balance_held_out
-from calibration.importers import find_calibration, load_rig
-from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again, mend
+from calibration.importers import find_calibration, holds_lenses_alone, load_lenses, load_rig
+from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again, matches_at, mend, refined
+from calibration.refine import LEVELS, PLACES, SOLVED, Refinement, RefineOptions, refine
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
@@ -46,6 +47,10 @@ class RigOptions:
     """Use a given calibration although the pictures contradict it"""
     repair: bool = True
     """Mend cameras of a given calibration that the pictures doubt, where they tell how; it is said by name"""
+    refine: bool = False
+    """Adjust all cameras to all matches, where that helps matches that the adjustment did not see. A solve of
+    cameras whose lenses are known is always refined"""
+    refining: RefineOptions = field(default_factory=RefineOptions)
     solve: SolveOptions = field(default_factory=lambda: SolveOptions(min_registered=1.0))
     """A camera without a pose is of no use: all must be placed, unless `min_registered` lets some be left out"""
     more_instants: int = 4
@@ -97,21 +102,32 @@ class ImportRig(Stage):
                 'calibration = "solve" into capture.toml to have it solved, or use it as it is with '
                 "--set rig.trust=true"
             )
-        if judgement.doubts:
+        last = len(footage.load_groups().times_ns) - 1
+        later = np.unique(np.linspace(self.first, last, self.options.more_instants + 1).round().astype(int))[1:]
+        doubted = bool(judgement.doubts)
+        if doubted:
             work.progress(0, 1, "comparing it with more pictures")
-            last = len(footage.load_groups().times_ns) - 1
-            later = np.unique(np.linspace(self.first, last, self.options.more_instants + 1).round().astype(int))[1:]
             judgement = look_again(judgement, map(footage.filmed, later), options=self.options.judge)
         if judgement.doubts and self.options.repair and not self.options.trust:
             work.progress(0, 1, "mending what the pictures doubt")
             judgement = mend(judgement, options=self.options.judge)
-        odd = {**_turned(judgement), **_strays(capture, source), **judgement.doubts, **judgement.mended}
+        if self.options.refine and not self.options.trust:
+            work.progress(0, 1, "refining all cameras")
+            more = () if doubted else later  # those have been looked at
+            judgement = refined(
+                judgement, map(footage.filmed, more), options=self.options.judge, refining=self.options.refining
+            )
+        moved = judgement.refined.told(self.options.refining) if judgement.refined else {}
+        odd = {**moved, **_turned(judgement), **_strays(capture, source), **judgement.doubts, **judgement.mended}
         _save_rig(judgement.rig, self.options, judgement.to_json(), work.out, odd=odd)
         held, verdict = f"{place} holds {kind}", judgement.matches.reason
-        return {"source": "import", "given": held, "reading": judgement.reading.value, "verdict": verdict}
+        notes = {"source": "import", "given": held, "reading": judgement.reading.value}
+        return {**notes, **_refined_notes(verdict, judgement.refined)}
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         yield "COLMAP", notes["given"]
+        if "unrefined" in notes:
+            yield "refining the cameras", notes["unrefined"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,18 +190,21 @@ class SolveRig(Stage):
     """All cameras, as filmed"""
     first: int
     """Instant from which on to solve"""
+    lenses: Files = field(default_factory=lambda: Files({}))
+    """A calibration of lenses alone, which are then known; else none"""
     options: RigOptions
 
     def build(self, work: Work) -> Notes:
         footage, options = Footage(self.take, work.site), self.options
         instants = complete_instants(footage.load_groups(), self.take.cameras, self.first)
-        rigs, problem = list[Rig](), None
+        lenses = self._load_lenses(footage, work) if self.lenses.sha256 else None
+        rigs, shots, problem = list[Rig](), list[Mapping[str, np.ndarray]](), None
         for chosen in _attempts(instants, options.more_instants):
             work.progress(0, 1, f"COLMAP, {len(chosen)} instant{'s' * (len(chosen) > 1)}")
             shots = [footage.filmed(instant) for instant in chosen]
             pictures = {name: [shot[name] for shot in shots] for name in self.take.cameras}
             try:
-                rigs.append(solve_rig(pictures, options.solve, work.scratch))
+                rigs.append(solve_rig(pictures, options.solve, work.scratch, lenses=lenses))
             except ValueError as error:
                 problem = error
             if rigs and len(rigs[-1].cameras) == len(self.take.cameras):
@@ -195,8 +214,46 @@ class SolveRig(Stage):
         rig = max(rigs, key=lambda solved: len(solved.cameras))
         kept = [name for name in self.take.cameras if name in rig.names]
         left = {name: LEFT_OUT for name in self.take.cameras if name not in kept}
-        _save_rig(rig.select(kept), options, {"source": rig.source}, work.out, odd=left)
-        return {"source": "COLMAP", "verdict": rig.source}
+        rig, done = rig.select(kept), None
+        if options.refine or lenses is not None:
+            work.progress(0, 1, "refining all cameras")
+            done = self._refined(rig, shots)
+        moved = done.told(options.refining) if done else {}
+        evidence = {"source": rig.source, **({"refined": done.to_json()} if done else {})}
+        _save_rig(done.rig if done else rig, options, evidence, work.out, odd={**moved, **left})
+        return {"source": "COLMAP", **_refined_notes(rig.source, done)}
+
+    def _load_lenses(self, footage: Footage, work: Work) -> Rig:
+        capture = find_capture(work.site.capture)
+        source = capture.calibration
+        if source is None or calibration_files(source).keys() != self.lenses.sha256.keys():
+            raise FileNotFoundError(f"the calibration of {capture.folder} is another one than when the run began")
+        sizes = _sizes(footage, footage.filmed(self.first), read_videos(work.path(self.take.groups)))
+        return load_lenses(source, self.take.cameras, sizes)
+
+    def _refined(self, rig: Rig, shots: Sequence[Mapping[str, np.ndarray]]) -> Refinement:
+        """By the instants that it was solved from."""
+        placed = ({name: shot[name] for name in rig.names} for shot in shots)
+        found = [pair for pairs in matches_at(rig, placed, options=self.options.judge) for pair in pairs]
+        return refine(
+            rig,
+            found,
+            levels=PLACES if self.lenses.sha256 else LEVELS,
+            options=replace(self.options.refining, adjust=SOLVED),
+        )
+
+    def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
+        if "unrefined" in notes:
+            yield "refining the cameras", notes["unrefined"]
+
+
+def _refined_notes(verdict: str, done: Refinement | None) -> Notes:
+    """The verdict with what refining did, or why it did nothing."""
+    if done is None:
+        return {"verdict": verdict}
+    if not done.freed:
+        return {"verdict": verdict, "unrefined": done.reason}
+    return {"verdict": f"{verdict}; {done.reason}"}
 
 
 def _attempts(instants: np.ndarray, more: int) -> list[list[int]]:
@@ -217,6 +274,8 @@ def find_rig(
         return SolveRig(take=take, first=plan.first, options=replace(options, trust=False))
     find_calibration(source)  # a folder without a calibration is a mistake, which no solution may hide
     files = workshop.files(calibration_files(source), "reading calibration")
+    if holds_lenses_alone(source):
+        return SolveRig(take=take, first=plan.first, lenses=files, options=replace(options, trust=False))
     return ImportRig(take=take, first=plan.first, files=files, options=options)
 
 

@@ -15,7 +15,7 @@ from calibration.rig import Rig
 from packuv.camera import PinholeCamera
 from packuv.files import save_json
 from packuv.footage import LensCamera, Transfer, Views
-from packuv.motion import MotionOptions, measure_motion
+from packuv.motion import MotionBackend, MotionOptions, measure_motion
 from sync.capture import Capture, find_capture, load_durations, probe_capture
 from sync.content import Activity, Offset, find_offsets
 from sync.content.sound import Sound, hear, starts_by_sound
@@ -120,7 +120,7 @@ def find_starts(workshop: Workshop, options: MotionOptions, transfer: Transfer |
         fps=capture.settings.fps,
         timecode_column=capture.settings.timecode_column,
         transfer=transfer,
-        options=replace(options, keep_flow=False),
+        options=replace(options, keep_flow=False, backend=MotionBackend.DIS),  # only masks are wanted
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from packuv.camera import PinholeCamera
 from packuv.files import load_json, save_json
-from packuv.motion import MotionCache, MotionOptions, measure_motion
+from packuv.motion import MotionBackend, MotionCache, MotionOptions, measure_motion
 from sync.align import FrameGroups, frame_period
 from sync.content import Activity, Content, ContentOptions, Offset, Window, find_offsets
 from tasks.artefacts.stage import Notes, Stage, Work
@@ -62,7 +62,7 @@ class CompareContent(Stage):
         first = self.take.first + window.start
         take = replace(self.take, cameras=self.unseen, light=None, first=first, stop=first + len(window))
         views = Footage(take, work.site).open_views()
-        options = replace(self.motion_options, keep_flow=False)
+        options = replace(self.motion_options, keep_flow=False, backend=MotionBackend.DIS)  # only masks are wanted
         cache = measure_motion(views, work.scratch / f"motion-{window.start}", options, workers=work.site.threads)
         whole = range(len(window))
         return {camera.name: activity_of(cache, column, camera, whole) for column, camera in enumerate(views.cameras)}

@@ -127,6 +127,8 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState, lig
             "near": key.bounds.near,
             "scene_radius": key.bounds.radius,
             "metric": rig.metric,
+            # Absent where nobody knows it, likewise below, so that scenes keep their bytes.
+            **({"up": list(rig.up)} if rig.up else {}),
             "max_width": footage.take.pictures.max_width,
             "lenses": [lens_camera(camera).to_json() for camera in rig.cameras],
             # Absent where tags decide, so that scenes of such captures keep their bytes.

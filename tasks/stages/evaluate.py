@@ -147,7 +147,7 @@ def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
     if tolerance_ns is not None:
         tolerance_ns = whole(tolerance_ns, f"{what}: tolerance_ns", most=MOST_NS)
     options = AlignOptions(reference=reference, tolerance_ns=tolerance_ns, clock=ClockMode(clock))
-    timecodes = load_timecodes(found, infos)
+    timecodes = load_timecodes(found, infos, options.clock)
     if options.clock is ClockMode.CONTENT:  # the starts have what time_offset_s added in them
         starts = fields(field(sync, STARTS_NS, what), f"{what}: {STARTS_NS}")
         names = {name: f"{what}: {STARTS_NS}: {name}" for name in timecodes}

@@ -108,7 +108,7 @@ class UsePlate(Stage):
 class FitBackdrop(Stage):
     """Fit what stands still, from which all keyframes start: state.npz and key.json, with the quantizer of all."""
 
-    name, version = "backdrop", 3
+    name, version = "backdrop", 4
     take: Take
     background: Key
     options: FirstOptions
@@ -171,7 +171,7 @@ class PatchBackground(Stage):
 class PatchBackdrop(Stage):
     """Fit the backdrop of an epoch from that of one beside it: state.npz and key.json."""
 
-    name, version = "backdrop", 3
+    name, version = "backdrop", 4
     take: Take
     previous: Key
     before: Key
@@ -202,7 +202,7 @@ class PatchBackdrop(Stage):
 class FitFirst(Stage):
     """Fit the keyframe that a chain without backdrop starts with: state.npz and key.json, with the quantizer of all."""
 
-    name, version = "key", 9
+    name, version = "key", 10
     take: Take
     instant: int
     options: FirstOptions
@@ -231,7 +231,7 @@ class FitNext(Stage):
     """Fit a keyframe from the backdrop, another keyframe, or the last frame of that one's segment: state.npz and
     key.json."""
 
-    name, version = "key", 8
+    name, version = "key", 9
     take: Take
     background: Key | None
     previous: Key

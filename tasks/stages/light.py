@@ -26,7 +26,7 @@ class MeasureLight(Stage):
     All pictures pass here, so it also finds the damaged ones, which count as missing from here on.
     """
 
-    name, version = "light", 1
+    name, version = "light", 2
     take: Take
     """All cameras, as filmed"""
     fitted: tuple[str, ...]

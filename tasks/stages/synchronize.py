@@ -15,10 +15,13 @@ from sync.capture import (
     find_capture,
     load_durations,
     load_timecodes,
+    offsets_of,
     picture_notes,
     probe_capture,
+    timing_notes,
     with_offsets,
 )
+from sync.clock import ClockMode
 from sync.probe import VideoInfo
 from sync.timecode import Timecodes
 from tasks.artefacts.recipe import write_json
@@ -47,7 +50,7 @@ class Synchronize(Stage):
     timecode_column: str | None
     """Likewise"""
     time_offset_s: Mapping[str, str] = field(default_factory=dict)
-    """Likewise, as text"""
+    """Likewise, and what t_offsets.json adds, as text"""
     starts: Key | None = None
     """When the cameras began to film; None where times tell it"""
     options: AlignOptions
@@ -57,10 +60,10 @@ class Synchronize(Stage):
         self._check(found)
         infos = probe_capture(found, work.progress)
         if self.starts is None:
-            timecodes = load_timecodes(found, infos)
+            timecodes = load_timecodes(found, infos, self.options.clock)
         else:
             starts = read_starts(work.path(self.starts))
-            timecodes = with_offsets(found, begun(load_durations(found, infos), starts))
+            timecodes = with_offsets(found, begun(load_durations(found, infos), starts), self.options.clock)
         groups, report = align(timecodes, self.options)
         groups.save(work.out, report)
         save_index(build_index(timecodes, report.clocks), work.out)
@@ -68,7 +71,13 @@ class Synchronize(Stage):
         rate = found.settings.fps or _nominal_rate(infos, report)
         write_json(work.out / "videos.json", {"rate": rate, "videos": videos})
         facts = {"instants": len(groups), "cameras": len(groups.cameras), "reference": groups.reference}
-        notes = [*found.notes, *picture_notes(found, infos), *(note for info in infos.values() for note in info.notes)]
+        timing = timing_notes(found, infos, self.options.clock)
+        notes = [
+            *found.notes,
+            *picture_notes(found, infos),
+            *timing,
+            *(note for info in infos.values() for note in info.notes),
+        ]
         return {**facts, FOOTAGE: notes} if notes else facts
 
     def _check(self, found: Capture) -> None:
@@ -77,7 +86,7 @@ class Synchronize(Stage):
         if (videos, timecodes) != (list(self.videos.sha256), list(self.timecodes.sha256)) or (
             settings.fps,
             settings.timecode_column,
-            _offsets(found),
+            _offsets(found, self.options.clock),
         ) != (self.fps, self.timecode_column, self.time_offset_s):
             raise ValueError(f"files or settings of {found.folder} changed while they were read; run the command again")
 
@@ -90,14 +99,14 @@ def synchronize(workshop: Workshop, options: AlignOptions, starts: Key | None) -
         timecodes=workshop.files(capture.timecodes, "reading timecodes"),
         fps=capture.settings.fps,
         timecode_column=capture.settings.timecode_column,
-        time_offset_s=_offsets(capture),
+        time_offset_s=_offsets(capture, options.clock),
         starts=starts,
         options=options,
     )
 
 
-def _offsets(capture: Capture) -> dict[str, str]:
-    return {camera: str(seconds) for camera, seconds in capture.settings.time_offset_s.items()}
+def _offsets(capture: Capture, clock: ClockMode) -> dict[str, str]:
+    return {camera: str(seconds) for camera, seconds in offsets_of(capture, clock).items()}
 
 
 def read_starts(folder: Path) -> dict[str, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,24 @@ import numpy as np
 
 from packuv.files import save_json
 from packuv.fit.patch import in_one_place
-from packuv.motion import MotionCache, MotionOptions, Patches, PatchOptions, find_patches, measure_motion
+from packuv.motion import (
+    MotionCache,
+    MotionOptions,
+    Patches,
+    PatchOptions,
+    Raft,
+    RaftOptions,
+    find_patches,
+    measure_motion,
+)
 from packuv.motion.keyframes import KeyframeOptions, choose_keyframes, motion_curve, segments
-from tasks.artefacts.stage import Notes, Stage, Work
+from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.stages.footage import Footage, Take
 
 MOTION, KEYFRAMES, PATCHES = "motion", "keyframes.json", "patches.npz"
+RAFT = "raft"
+"""Name of its weights among the files that a stage reads"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +43,34 @@ class FindMotion(Stage):
     def build(self, work: Work) -> Notes:
         folder = work.scratch / MOTION
         views = Footage(self.take, work.site).open_views()
-        cache = measure_motion(views, folder, self.options, workers=work.site.threads, progress=work.progress)
+        raft, threads = self.raft_model(), work.site.threads
+        cache = measure_motion(views, folder, self.options, raft=raft, workers=threads, progress=work.progress)
         folder.rename(work.out / MOTION)
         measured = cache.previous >= 0  # nothing where there is a single instant
         share = float(np.nanmean(_shares(cache))) if measured.any() else 0.0
         return {"pictures": int(measured.sum()), "moving_share": share}
+
+    def raft_model(self) -> Raft | None:
+        """What estimates optical flow instead of DIS."""
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FindMotionByRaft(FindMotion):
+    """Measure the same with optical flow by RAFT."""
+
+    network: Files
+    """Digest of the file at `weights`, under RAFT"""
+    raft: RaftOptions
+    """Without the name of that file"""
+    weights: str = field(default="", compare=False)
+    """Path of the weights"""
+
+    def raft_model(self) -> Raft:
+        model = Raft(Path(self.weights), updates=self.raft.updates, device=self.raft.device)
+        if model.facts["sha256"] != self.network.sha256[RAFT]:
+            raise ValueError(f"{self.weights} changed since it was first read; run the command again")
+        return model
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from calibration.exporters import write_colmap, write_poses_bounds, write_transforms
-from calibration.importers import find_calibration, load_rig
+from calibration.importers import find_calibration, holds_lenses_alone, load_lenses, load_rig
 from calibration.importers.names import natural_key
 from calibration.rig import Camera, Rig
 from tests.support.calibration_scene import arc, look_at, ring
@@ -575,3 +575,22 @@ def test_a_damaged_matrix_of_opencv_is_refused(tmp_path, was, now):
     (tmp_path / "intri.yml").write_text(text.replace(was, now, 1))
     with pytest.raises(ValueError, match=r"K_cam\d+ must "):
         load_rig(tmp_path, ("cam1", "cam2"))
+
+
+def test_lenses_without_poses_are_known_lenses(tmp_path):
+    matrix = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [{}]\n"
+    text = '%YAML:1.0\n---\nnames:\n   - "a"\n   - "b"\n'
+    for name, focal in (("a", 500), ("b", 600)):
+        text += f"K_{name}: " + matrix.format(3, 3, f"{focal}, 0, 319.5, 0, {focal}, 179.5, 0, 0, 1")
+        text += f"dist_{name}: " + matrix.format(5, 1, "-0.1, 0.02, 0, 0, 0")
+    (tmp_path / "intri.yml").write_text(text)
+    sizes = {"a": (640, 360), "b": (640, 360)}
+    assert holds_lenses_alone(tmp_path)
+    lenses = load_lenses(tmp_path, ("b", "a"), sizes)
+    assert lenses.names == ("b", "a")
+    assert [(c.fx, c.cx, c.cy) for c in lenses.cameras] == [(600, 320, 180), (500, 320, 180)]
+    assert lenses["a"].distortion[:2] == (-0.1, 0.02)
+    with pytest.raises(ValueError, match="c"):
+        load_lenses(tmp_path, ("a", "c"), {**sizes, "c": (640, 360)})
+    (tmp_path / "extri.yml").write_text("%YAML:1.0\n---\n")
+    assert not holds_lenses_alone(tmp_path)

@@ -12,6 +12,8 @@ import pytest
 
 from calibration.features import FeatureOptions
 from calibration.importers import load_rig
+from calibration.judge import matches_at
+from calibration.refine import PLACES, SOLVED, RefineOptions, refine
 from calibration.rig import Rig
 from calibration.solve import Lens, SolveOptions, solve_rig
 from tests.support.calibration_scene import filmed, render
@@ -62,6 +64,21 @@ def test_a_textured_room_gives_its_cameras_back(tmp_path):
         np.array_equal(a.camera_from_world, b.camera_from_world)
         for a, b in zip(rig.cameras, again.cameras, strict=True)
     )
+
+
+@pytest.mark.slow
+def test_known_lenses_stay_as_they_are_and_steady_the_rig(tmp_path):
+    truth, _, pictures = filmed(6)
+    rig = solve_rig(pictures, replace(OPTIONS, shared_lens=False), tmp_path, lenses=truth)
+    assert [(c.fx, c.fy, c.cx, c.cy, c.distortion) for c in rig.cameras] == [
+        (c.fx, c.fy, c.cx, c.cy, c.distortion) for c in truth.cameras
+    ]
+    matches = next(matches_at(rig, [pictures]))
+    done = refine(rig, matches, levels=PLACES, options=RefineOptions(adjust=SOLVED))
+    solved, refined = errors(rig, truth), errors(done.rig, truth)
+    assert refined <= solved
+    assert refined[0] < 0.005
+    assert refined[1] < 0.15  # pictures of 320x240: a pixel is 0.19 degrees
 
 
 @pytest.mark.slow

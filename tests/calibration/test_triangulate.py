@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.accept import Verdict
+from calibration.accept import Verdict, matches_report
 from calibration.features import FeatureOptions
 from calibration.judge import Reading, judge
 from calibration.multiview import Sightings, locate, medians
@@ -18,6 +18,7 @@ from calibration.triangulate import (
     choose_pairs,
     on_one_geometry,
     patch_light,
+    reprojections_px,
     triangulate,
 )
 from tests.support.calibration_scene import arc, filmed, off_surface, render, ring
@@ -261,3 +262,24 @@ def test_poses_of_other_cameras_are_rejected():
     judgement = judge(shuffled, pictures, options=OPTIONS)
     assert judgement.matches.verdict is Verdict.REJECTED
     assert judgement.rig is shuffled
+
+
+def test_an_observation_is_as_far_off_as_it_was_moved() -> None:
+    rig, xyz = ring(4), ball(50)
+    seen = sightings(rig, xyz)
+    xy = seen.pixels + np.where(seen.camera[:, None] == 1, (3.0, 4.0), 0.0)
+    points = SparsePoints(
+        cameras=rig.names,
+        xyz=xyz,
+        rgb=np.zeros((50, 3), np.uint8),
+        views=np.full(50, 4, np.int32),
+        error_px=np.zeros(50, np.float32),
+        instant=np.zeros(50, np.int32),
+        point=seen.point,
+        camera=seen.camera,
+        xy=xy.astype(np.float32),
+        colour=np.zeros((200, 3), np.float32),
+        matches=matches_report(rig, []),
+    )
+    # positions are float32, 3e-5 of a pixel
+    assert np.allclose(reprojections_px(rig, points), np.where(seen.camera == 1, 5.0, 0.0), atol=1e-3)

@@ -11,30 +11,20 @@ import pytest
 import torch
 
 from packuv.lpips import Lpips, lacking
+from tests.support.networks import published
 
 RNG = np.random.default_rng(3)
 TRUTH = RNG.random((3, 72, 96)).astype(np.float32)
 NOISY = np.clip(TRUTH + RNG.normal(0, 0.1, TRUTH.shape), 0, 1).astype(np.float32)
 
 
-def published() -> tuple[Any, Any]:
-    """The packages `lpips` and `torchvision`; the latter built for another torch, too, for it is only read here."""
-    try:
-        import torchvision
-    except RuntimeError:  # its compiled operators do not load, and it only asks for their names
-        for name in ("nms", "qnms"):
-            torch.library.define(f"torchvision::{name}", "(Tensor dets, Tensor scores, float threshold) -> Tensor")
-        import torchvision
-    import lpips
-
-    return lpips, torchvision
-
-
 @pytest.fixture(scope="module", params=[("alex", "alexnet"), ("vgg", "vgg16")], ids=["alexnet", "vgg16"])
 def reference(request, tmp_path_factory) -> tuple[Any, Path]:
     """LPIPS as its authors publish it, and a file of the same backbone's random weights in torchvision's form."""
     net, architecture = request.param
-    lpips, torchvision = published()
+    torchvision = published()
+    import lpips  # which imports torchvision, as it can be by now
+
     torch.manual_seed(1)
     backbone = getattr(torchvision.models, architecture)(weights=None)
     state = {name: value for name, value in backbone.state_dict().items() if name.startswith("features")}

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from calibration.rig import Rig
@@ -64,6 +65,18 @@ def test_takes_of_a_day_share_the_rig_that_whoever_comes_first_makes(day, tmp_pa
     later = run(day / "take01", out, stop_after="calibrate")
     assert {event.label for event in later.events if event.outcome == "reused"} == {"sync", "rig"}
     assert Store(out / "take01" / "store").verify() == []
+
+
+def test_the_take_that_lends_the_rig_tells_its_scale(day, tmp_path):
+    text = (day / "take01" / "capture.toml").read_text()
+    (day / "take01" / "capture.toml").write_text(f'{text}distance = {{cameras = ["cam01", "cam02"], metres = 7}}\n')
+    take = run(day / "take02", tmp_path / "runs", stop_after="calibrate")
+    (path,) = (take.folder / "store" / "rig").glob("*/rig.json")
+    rig = Rig.load(path)
+    assert rig.metric
+    assert np.linalg.norm(rig["cam01"].centre - rig["cam02"].centre) == pytest.approx(7)
+    assert "a unit of it is" in rig.source
+    assert "take01: scale" in {event.label for event in take.events}
 
 
 def test_a_take_that_lends_to_itself_or_is_not_there_ends_with_one_sentence(day, tmp_path, capsys):

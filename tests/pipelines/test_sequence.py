@@ -15,8 +15,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from calibration.rig import Rig
 from packuv.scene import open_scene
 from pipelines.cli import main
 from pipelines.commands.progress import TerminalProgress
@@ -119,6 +121,17 @@ def test_info_and_verify_tell_what_the_scene_is(first, capsys, tmp_path):
     found = json.loads(capsys.readouterr().out)
     assert found["bad"]
     assert found["span"][0] <= len(data) // 2 < found["span"][1]
+
+
+def test_a_report_written_anew_is_the_same_but_for_its_limits(first):
+    folder, keep = first[0].folder, ("report.html", "report.json")
+    before = [(folder / name).read_text() for name in keep]
+    assert main(["report", str(folder)]) == 0
+    assert [(folder / name).read_text() for name in keep] == before
+    assert main(["report", str(folder), "--set", "report.psnr_db=98"]) == 0
+    assert json.loads((folder / "report.json").read_text())["verdict"]["fitness"] == "not fit for delivery"
+    assert main(["report", str(folder)]) == 0
+    assert [(folder / name).read_text() for name in keep] == before
 
 
 def test_same_command_finds_everything_there(first, capture):
@@ -230,6 +243,25 @@ def test_light_may_be_left_out_and_changes_nothing_where_it_is_steady(first, cap
     assert set(artefacts(without)) == {"sync", "rig", "points", "motion", "content", "patches", "keyframes"}
     keys = artefacts(outcome)
     assert all(keys[stage] == key for stage, key in artefacts(without).items())
+
+
+def test_a_known_distance_and_up_reach_the_points_and_change_nothing_before(first, capture, tmp_path):
+    known = tmp_path / "tiny"
+    shutil.copytree(capture, known)
+    text = (known / "capture.toml").read_text()
+    (known / "capture.toml").write_text(
+        f'{text}up = "cameras"\ndistance = {{cameras = ["cam01", "cam02"], metres = 7}}\n'
+    )
+    outcome, said = run(request(known, first[0].folder.parent, name="known", stop_after="flow"))
+    rig = Rig.load(outcome.folder / "store" / artefacts(outcome)["points"] / "rig.json")
+    assert np.linalg.norm(rig["cam01"].centre - rig["cam02"].centre) == pytest.approx(7)
+    assert rig.metric
+    assert rig.up is not None
+    assert rig.up[2] > 0.99  # the simulated studio's floor is level
+    assert "scale" in said
+    assert artefacts(outcome)["rig"] == artefacts(first[0])["rig"], "the rig as it was placed is the same one"
+    again, _ = run(request(known, first[0].folder.parent, name="known", stop_after="flow"))
+    assert made(again) == set()
 
 
 def test_flow_shows_what_was_skipped(workflow, first, capture):

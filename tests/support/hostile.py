@@ -336,6 +336,7 @@ def write_worst(folder: Path) -> None:
         "blocks": (("tracks", 0, "blocks_across"), 2**40),
         "rows": (("segments", 0, "rows"), 2**60),
         "near": (("extra", "near"), 1e400),
+        "up": (("extra", "up"), [0.0, 1e30, 0.0]),
         "times": (("times_ns",), [2**63 - 1 - k for k in range(6)]),
         "light": (("light", 1, 3), 10**400),
         "light-frames": (("light",), [[1] * 300_000] * 3),

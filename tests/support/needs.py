@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-KINDS = ("avx2", "cuda", "ffmpeg", "chromium", "data", "postgres")
+KINDS = ("avx2", "cuda", "ffmpeg", "chromium", "data", "postgres", "weights")
 VARIABLE = "PACKUV_REQUIRE"
 
 

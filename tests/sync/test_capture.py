@@ -115,6 +115,7 @@ def test_settings_are_read(tmp_path: Path) -> None:
         ("time_offset_s = { cam1 = 'late' }", "time_offset_s of 'cam1' must be a number of seconds, .* but is 'late'"),
         ("time_offset_s = { cam1 = nan }", "time_offset_s of 'cam1' must be a number of seconds"),
         ("time_offset_s = { cam1 = 1e9 }", "time_offset_s of 'cam1' must be a number of seconds, at most 1000000"),
+        ("time_offset_s = { cam1 = 1e999999999 }", "time_offset_s of 'cam1' must be a number of seconds, at most"),
         ("time_offset_s = { cam3 = 1 }", "time_offset_s names 'cam3', which has no video; did you mean 'cam"),
         ("calibration = 'solve'\nrig_from = 'take01'", "from rig_from or from calibration, not both"),
     ],

@@ -14,6 +14,8 @@ from packuv.fit.options import FitOptions
 from packuv.fit.shots import Shot
 from packuv.fit.solver import Solver
 from packuv.fit.start.bounds import Bounds
+from packuv.fit.start.first import round_gaussians
+from packuv.gaussians.floats import opacity
 from packuv.raster import render
 from tests.support.dense_raster import OPTIONS, camera, scene
 
@@ -91,3 +93,20 @@ def test_what_shows_least_makes_room_and_what_is_frozen_stays():
     assert len(tried.rows) == len(tried.model) == 50
     tried.make_room(shots(0.0))
     assert len(tried.model) == 50
+
+
+@pytest.mark.parametrize(("black_share", "stays"), [(0.1, True), (0.6, False)], ids=["a room", "a bare stage"])
+def test_black_is_a_surface_in_a_room_and_nothing_on_a_bare_stage(black_share, stays):
+    """One black Gaussian before black: nobody can tell, so how much of the pictures is black decides."""
+    black = round_gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.array([0.08]), opacity=0.8, sh_degree=0)
+    targets = []
+    for view in VIEWS:
+        picture = np.full((3, view.height, view.width), 0.5, np.float32)
+        side = np.sqrt(black_share) / 2
+        rows, columns = (slice(round((0.5 - side) * n), round((0.5 + side) * n)) for n in (view.height, view.width))
+        picture[:, rows, columns] = 0
+        targets.append(Shot(view, picture))
+    options = FitOptions(near_jitter=0.0)
+    tried = Solver(Model(black), Bounds(np.zeros(3), 2.0, OPTIONS.near), options, np.random.default_rng(0))
+    tried.run(targets, 60, of=60)
+    assert bool(opacity(tried.model.gaussians)[0] > 0.5) is stays

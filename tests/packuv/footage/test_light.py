@@ -200,6 +200,29 @@ def test_a_shadow_over_half_the_picture_is_no_exposure():
     assert light.steady
 
 
+def test_what_leaves_a_black_stage_takes_no_light_along():
+    """A door of one colour slides away before black, as a person leaves: the place goes dark, the light does not."""
+
+    def stage(picture: np.ndarray, instant: int) -> None:
+        standing = picture[:30, :60].copy()
+        picture[:] = 0
+        picture[:30, :60] = standing
+        gone = max(0, 4 * (instant - INSTANTS // 2))
+        picture[20:, 70 + gone : 130] = (0.35, 0.45, 0.4)
+
+    bare = ratios(dict.fromkeys(NAMES[:4], STEADY), stage)
+    for measured_ratio in bare.values():
+        assert np.abs(measured_ratio.whole[np.isfinite(measured_ratio.whole)]).max() < 0.1
+    assert measured(bare).steady
+
+
+def test_lamps_that_go_out_are_light():
+    logs = STEADY.copy()
+    logs[10:12] = -4.5
+    light = measured(ratios(dict.fromkeys(NAMES[:3], logs)))
+    assert (light.light[10:12] < light.light[[9, 12]] - 3).all()
+
+
 def test_one_instant_is_steady():
     assert measured(ratios({name: np.zeros((1, 3)) for name in NAMES[:3]})).steady
 

@@ -690,5 +690,11 @@ def test_a_header_is_checked_at_once():
         SceneHeader(quantizer(), times, Fraction(30), held_out=("cam9",))
     with pytest.raises(ValueError, match="plain JSON"):
         SceneHeader(quantizer(), times, Fraction(30), extra={"a": np.float32(1)})
+    with pytest.raises(ValueError, match=r"up, extra\.up, must be a unit vector"):
+        SceneHeader(quantizer(), times, Fraction(30), extra={"up": [0, 0, 2]})
+    with pytest.raises(ValueError, match=r"extra\.up"):
+        SceneHeader(quantizer(), times, Fraction(30), extra={"up": "north"})
+    assert SceneHeader(quantizer(), times, Fraction(30), extra={"up": [0, 0.6, 0.8]}).up == (0, 0.6, 0.8)
+    assert SceneHeader(quantizer(), times, Fraction(30)).up is None
     with pytest.raises(ValueError, match="rate must be positive"):
         SceneHeader(quantizer(), times, Fraction(0))

@@ -446,6 +446,12 @@ def test_the_page_is_told_light_where_it_is_not_steady() -> None:
     assert np.array_equal(told["light"][:7], LIGHT)
 
 
+def test_the_page_is_told_up_where_it_is_known() -> None:
+    source = make_source()
+    assert "up" not in describe(source)
+    assert describe(replace(source, up=(0.0, 0.6, -0.8)))["up"] == [0.0, 0.6, -0.8]
+
+
 @pytest.mark.slow
 def test_the_page_shows_every_frame_in_its_light(browser: Browser) -> None:
     plain = make_source(1, count=6000)

@@ -18,6 +18,7 @@ def facts(segments: int) -> dict:
         "sh_degree": 0,
         "light": None,
         "lossless": True,
+        "compression": None,
         "tolerance": {"position": 0, "attribute": 0},
         "cameras": ["cam01", "cam02"],
         "held_out": [],

@@ -22,7 +22,10 @@ from calibration.accept import check_rig
 from calibration.rig import Camera, Rig
 from sync.align import CameraReport, SyncReport
 from sync.clock import Clock, ClockMode, ClockState
-from tasks.report.facts import MAX_PSNR_DB, LastingChange
+from tasks.artefacts.recipe import restore
+from tasks.report.facts import MAX_PSNR_DB, CameraEvidence, LastingChange, mean_by_frame
+from tasks.report.findings import Severity
+from tasks.report.limits import LIMITS
 from tasks.report.page import SECTIONS, duration, page_text
 from tasks.report.plots import (
     MOST_BARS,
@@ -32,12 +35,17 @@ from tasks.report.plots import (
     bar_chart,
     line_chart,
     rig_axes,
+    rig_model,
     rig_views,
     thinned,
 )
-from tasks.report.record import report_json, summary
+from tasks.report.record import report_json
+from tasks.report.sections import VIEWER
+from tasks.report.summary import summary
+from tasks.report.verdict import Fitness, verdict
 from tasks.report.write import (
     Comparison,
+    Finding,
     FrameScore,
     LightCurve,
     MotionCurve,
@@ -116,6 +124,7 @@ def make_report() -> ReportInput:
         rig=rig,
         held_out=HELD_OUT,
         check=check_rig(rig),
+        evidence={"cam0": CameraEvidence(210, 0.21, "measured with the others"), "cam1": CameraEvidence(gain="not")},
         light=make_light(),
         motion=MotionCurve(np.linspace(0, 2, FRAMES), (0, 7), (LastingChange(7, ("cam0", "cam2")),)),
         scores=make_scores(),
@@ -179,9 +188,11 @@ def test_the_page_has_every_section_and_stands_alone() -> None:
     page = Page(text)
     assert set(SECTIONS) | {"summary"} <= set(page.ids)
     assert len(page.ids) == len(set(page.ids))
-    assert all(address.startswith(("#", "data:image/jpeg;base64,")) for address in page.addresses)
+    inside = ("#", "data:image/jpeg;base64,", f"{VIEWER}/#frame=")  # a link that a person may follow
+    assert all(address.startswith(inside) for address in page.addresses)
     assert {address[1:] for address in page.addresses if address.startswith("#")} <= set(page.ids)
-    assert not re.search(r"url\(|@import|https?:|<link|<iframe", text)
+    told = text.replace(f'href="{VIEWER}/', "").replace("http://www.w3.org/2000/svg", "")
+    assert not re.search(r"url\(|@import|https?:|<link|<iframe", told)
     for name in SECTIONS:
         assert 'class="none"' not in section(text, name), name
 
@@ -296,7 +307,8 @@ def test_json_holds_the_numbers(tmp_path: Path) -> None:
     }
     assert data["scene"]["frame_bytes"] == list(make_scene().frame_bytes)
     assert data["summary"]["verified"] is True
-    assert data["findings"] == [{"section": item.section, "text": item.text} for item in findings(report)]
+    assert restore(tuple[Finding, ...], data["findings"]) == findings(report)
+    assert data["verdict"]["fitness"] == "fit for delivery"
 
 
 def test_equal_pictures_stay_finite(tmp_path: Path) -> None:
@@ -354,13 +366,78 @@ def test_bad_colours_scores_files_and_stages_are_named() -> None:
     )
     assert texts(bad) == [
         "stages: The stage 'encode' failed: the disk is full.",
-        "colour: cam2 needs a colour gain of 0.50.",
+        "quality: The mean of 17.3 dB is below the limit of 20 dB: the difference shows at a glance.",
+        "size: The scene file does not decode to what was fitted: frame 3 differs.",
         "quality: cam1 scores 10.8 dB, 6.5 dB below the median camera.",
         "quality: 1 of 12 frames score 3 dB or more below the median frame, the worst being frame 9 with 9.6 dB.",
-        "quality: The mean of 17.3 dB is poor: the difference shows at a glance.",
-        "size: The scene file does not decode to what was fitted: frame 3 differs.",
         "gaussians: 80% of the Gaussians are dynamic: noise may pass for motion.",
+        "colour: cam2 needs a colour gain of 0.50.",
     ]
+
+
+def judged(report: ReportInput, **limits: float) -> tuple[Fitness, str]:
+    kept = replace(LIMITS, **limits)
+    found = verdict(report, kept, findings(report, kept))
+    return found.fitness, found.text
+
+
+def test_nine_gains_are_one_line_with_each_as_evidence() -> None:
+    rig = make_rig(9)
+    gains = [1.3 + 0.1 * index for index in range(9)]
+    cameras = tuple(replace(c, gains=(gain, 1.0, 1.0)) for c, gain in zip(rig.cameras, gains, strict=True))
+    (finding,) = findings(replace(make_report(), rig=replace(rig, cameras=cameras)))
+    assert finding.text == (
+        "9 cameras need a colour gain beyond 1.25 or 1/1.25: cam0, cam1, cam2, cam3, cam4, cam5 and 3 more."
+    )
+    assert [f"cam{index} needs a colour gain of {gain:.2f}." for index, gain in enumerate(gains)] == list(
+        finding.evidence
+    )
+    assert finding.cure
+
+
+def test_the_verdict_says_fit_unfit_or_that_nobody_can_tell() -> None:
+    report = make_report()
+    level = summary(report)["psnr_db"]
+    fitness, text = judged(report)
+    assert (fitness, f"{level:.2f} dB" in text) == (Fitness.FIT, True)
+    assert judged(report, psnr_db=level - 0.01)[0] is Fitness.FIT
+    fitness, text = judged(report, psnr_db=level + 0.1)
+    assert fitness is Fitness.UNFIT
+    assert "below the limit" in text
+    assert "to do:" in text
+    assert page_text(report, replace(LIMITS, psnr_db=40.0)).count('class="verdict unfit"') == 1
+    for missing in ({"held_out": ()}, {"scores": ()}, {"scene": None}, {"scene": replace(make_scene(), verified=None)}):
+        assert judged(replace(report, **missing))[0] is Fitness.UNJUDGED
+
+
+@pytest.mark.parametrize(
+    "limit", [{"moving_db": 23.0}, {"flicker": 0.01}, {"mb_per_30_frames": 1.0}], ids=lambda limit: next(iter(limit))
+)
+def test_limits_of_a_delivery_block_it_where_they_are_set(limit: dict[str, float]) -> None:
+    scores = tuple(replace(score, moving_db=22.0, flicker=0.02) for score in make_scores())
+    report = replace(make_report(), scores=scores)
+    assert judged(report)[0] is Fitness.FIT
+    assert judged(report, **limit)[0] is Fitness.UNFIT
+    blocking = [item for item in findings(report, replace(LIMITS, **limit)) if item.severity is Severity.BLOCKS]
+    assert len(blocking) == 1
+    assert blocking[0].cure
+
+
+def test_a_frame_is_not_worse_because_the_better_camera_did_not_film_it() -> None:
+    whole = [
+        FrameScore(camera, frame, level, 0.9) for camera, level in (("a", 24.0), ("b", 18.0)) for frame in range(9)
+    ]
+    part = [score for score in whole if (score.camera, score.frame) != ("a", 4)]
+    assert mean_by_frame(part) == pytest.approx(mean_by_frame(whole)) == dict.fromkeys(range(9), pytest.approx(21.0))
+
+
+def test_the_model_that_turns_has_the_cameras_on_their_ring() -> None:
+    model = rig_model(make_rig(8).cameras, held_out=["cam2"], volume=Volume((0, 0, 0), 1.0))
+    tips = np.array([camera["points"][0] for camera in model["cameras"]])
+    middles = np.array([np.mean(camera["points"][1:], axis=0) for camera in model["cameras"]])
+    assert np.allclose(np.linalg.norm(tips, axis=1), 1, atol=1e-3)
+    assert (np.linalg.norm(middles, axis=1) < 0.9).all()  # they look inwards
+    assert [camera["name"] for camera in model["cameras"] if camera["held"]] == ["cam2"]
 
 
 def falling(slope_db: float, frames: int = 60) -> tuple[FrameScore, ...]:
@@ -602,6 +679,9 @@ def test_the_rig_is_seen_from_above_and_from_the_side() -> None:
     across, away, up = rig_axes(rig.cameras)
     assert np.allclose(up, [0, 0, 1])
     assert np.allclose(np.cross(across, away), up)
+    tilted = (0.0, 0.6, 0.8)
+    assert np.allclose(rig_axes(rig.cameras, tilted)[2], tilted)
+    assert np.allclose(np.stack(rig_axes(rig.cameras, tilted)) @ np.stack(rig_axes(rig.cameras, tilted)).T, np.eye(3))
     above, side = rig_views(rig.cameras, held_out=["cam2"], volume=Volume((0, 0, 0), 1.0), unit="m")
     dots = [
         [(float(c.get("cx", 0)), float(c.get("cy", 0))) for c in svg_root(view).iter("circle") if c.get("r") == "3"]

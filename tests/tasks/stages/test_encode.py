@@ -111,7 +111,17 @@ def test_the_header_takes_light_of_the_instants(site, take, key):
     footage, state = Footage(take, site), KeyState.load(site.path(key))
     light = np.linspace(-0.2, 0.2, 18).reshape(6, 3).round(5)
     assert np.array_equal(scene_header(footage, (), state, Light(light.astype(np.float32))).light, light)
-    assert not scene_header(footage, (), state).light.any()
+    plain = scene_header(footage, (), state)
+    assert not plain.light.any()
+    assert "up" not in plain.extra
+
+
+def test_the_header_says_where_up_is_where_that_is_known(site, take, key):
+    rig = replace(Footage(take, site).load_rig(), up=(0.0, -0.6, 0.8), metric=True)
+    upright = replace(take, rig=put(site, "rig", lambda out: rig.save(out / RIG), up="known"))
+    header = scene_header(Footage(upright, site), (), KeyState.load(site.path(key)))
+    assert header.up == (0.0, -0.6, 0.8)
+    assert header.extra["metric"] is True
 
 
 def test_what_is_fitted_so_far_plays_and_grows_into_the_whole(site, take, key, fitted, tmp_path):

@@ -1,6 +1,7 @@
 """Versions that cannot lie: a stage that makes something else of the same input has another version.
 
-SolveRig and FindStarts are not watched: they need larger pictures and longer videos than a test can afford.
+SolveRig and FindStarts are not watched: they need larger pictures and longer videos than a test can afford; nor is
+FindMotionByRaft, whose sums torch orders by machine.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def test_every_stage_is_recorded():
         if inspect.isclass(kind) and issubclass(kind, Stage) and not inspect.isabstract(kind)
     }
     recorded = {name.split(",")[0] for name in json.loads(golden.RECORD.read_text())}
-    assert kinds - recorded == {"SolveRig", "FindStarts"}
+    assert kinds - recorded == {"SolveRig", "FindStarts", "FindMotionByRaft"}
 
 
 ENTRY = {"version": 3, "inputs": "a", "outputs": "b"}

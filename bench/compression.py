@@ -1,0 +1,150 @@
+"""Size against distortion of one scene: lossless, by tolerance, by learned steps, and with one attribute coarse alone.
+
+    packuv bench compression --scene scene.mkv --out bench/results/compression_NAME.json
+
+Distortion is that of pictures of the scene's cameras, the lossless scene being the truth; SSIM and "unseen" are of
+cameras that were not fitted, from which no step was learned. Every row is a scene file that was written, verified and
+read again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench import command
+from packuv.compress.search import Judge
+from packuv.compress.sensitivity import sensitivity
+from packuv.compress.steps import Steps
+from packuv.gaussians.codes import attribute_count
+from packuv.metrics import decibels, ssim
+from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, Tolerance, open_scene, write_scene
+
+KINDS = {"position": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 9), "opacity": slice(9, 10)}
+"""Of the 3 + A kinds of codes; colours are the rest"""
+RAW_BITS = 8
+"""Of an attribute's code; a coordinate has twice as many"""
+
+
+class _Table:
+    """Files of one scene, measured one after the other."""
+
+    def __init__(self, scene: Scene, folder: Path) -> None:
+        self._scene, self._folder, self._judge = scene, folder, Judge(scene)
+        self.segments = [scene.segment(number) for number in range(len(scene.index.segments))]
+        self.codes = sum(len(part.key) * len(part) for part in self.segments)
+        self.sensitivity = sensitivity(scene, self._judge.learned, self._judge.frames)
+
+    def row(self, name: str, tolerance: Tolerance, steps: Steps | None = None) -> dict[str, Any]:
+        """Size and distortion of the scene so written."""
+        paths = [self._folder / f"{number}.npz" for number in range(len(self.segments))]
+        for path, segment in zip(paths, self.segments, strict=True):
+            (steps.segment(segment) if steps else segment).save(path)
+        header = self._scene.header
+        header = replace(header, quantizer=steps.quantizer(header.quantizer)) if steps else header
+        file = self._folder / "row.mkv"
+        written = write_scene(file, paths, header, options=EncodeOptions(tolerance))
+        return {
+            "name": name,
+            "bytes": written.bytes,
+            "track_bytes": dict(written.track_bytes),
+            "bits_per_gaussian_and_frame": written.bytes * 8 / self.codes,
+            **self._distortion(file),
+        }
+
+    def _distortion(self, file: Path) -> dict[str, float | None]:
+        errors: dict[bool, list[float]] = {False: [], True: []}
+        alike = []
+        for unseen, picture, truth in self._judge.pairs(file):
+            errors[unseen].append(float(np.square(picture - truth, dtype=np.float64).mean()))
+            if unseen:
+                alike.append(ssim(picture, truth))
+        known = {"psnr_db": errors[False], "psnr_unseen_db": errors[True]}
+        levels = {name: _level(values) for name, values in known.items()}
+        return {**levels, "ssim_unseen": float(np.mean(alike)) if alike else None}
+
+
+def _level(errors: Sequence[float]) -> float | None:
+    """PSNR, dB; None without pictures, or where all are equal."""
+    mean = float(np.mean(errors)) if errors else 0.0
+    return decibels(mean) if mean else None
+
+
+def measure(scene: Scene, folder: Path, *, noises: Sequence[float], coarse_bits: int) -> Iterator[dict[str, Any]]:
+    """Rows of the table."""
+    table, quantizer = _Table(scene, folder), scene.header.quantizer
+    for quality in Quality:
+        yield table.row(str(quality), TOLERANCES[quality])
+    for noise in noises:
+        steps = Steps.of_noise(noise, table.sensitivity, quantizer)
+        found = table.row(f"learned, noise {noise:g}", steps.tolerance, steps)
+        yield {**found, "position_steps": steps.position.tolist(), "attribute_steps": steps.attribute.tolist()}
+    count = attribute_count(quantizer.sh_degree)
+    for name, kinds in {**KINDS, "colour": slice(10, 3 + count)}.items():
+        wide = np.ones(3 + count)
+        wide[kinds] = 2.0 ** (RAW_BITS - coarse_bits)
+        fewer = 2 * coarse_bits if name == "position" else coarse_bits
+        wide[:3] **= 2
+        yield table.row(f"{name} in {fewer} bits", Tolerance(), Steps(wide[:3], wide[3:]))
+
+
+def table(rows: Sequence[dict[str, Any]], raw_bits: float) -> str:
+    """One line a row, as Markdown."""
+    lines = [
+        "| | MB | bits | to lossless | to raw | PSNR, dB | unseen | SSIM, unseen |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        bits = row["bits_per_gaussian_and_frame"]
+        figures = [f"{row['bytes'] / 1e6:.3f}", f"{bits:.2f}", f"{rows[0]['bytes'] / row['bytes']:.2f}"]
+        figures += [f"{raw_bits / bits:.1f}"]
+        figures += ["exact" if row[name] is None else f"{row[name]:.2f}" for name in ("psnr_db", "psnr_unseen_db")]
+        figures += ["" if row["ssim_unseen"] is None else f"{row['ssim_unseen']:.4f}"]
+        lines.append(f"| {' | '.join([row['name'], *figures])} |")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = command.parser("compression", __doc__)
+    parser.add_argument("--scene", type=Path, required=True, help="a lossless scene file")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument(
+        "--noises", type=float, nargs="+", default=[1e-7, 1e-6, 1e-5, 1e-4, 1e-3], help="of learned steps"
+    )
+    parser.add_argument("--coarse-bits", type=int, default=6, help="of an attribute that is coarse alone")
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    options = parser.parse_args(words)
+    with open_scene(options.scene) as scene, tempfile.TemporaryDirectory() as folder:
+        if not scene.lossless:
+            raise ValueError(f"{options.scene} is lossy; measure on a lossless scene file")
+        raw_bits = 48 + RAW_BITS * attribute_count(scene.header.quantizer.sh_degree)
+        rows = []
+        for row in measure(scene, Path(folder), noises=options.noises, coarse_bits=options.coarse_bits):
+            rows.append(row)
+            print(row, file=sys.stderr, flush=True)
+        facts = {
+            "source": options.scene.name,
+            "command": shlex.join(["packuv", "bench", "compression", *words]),
+            "load": os.getloadavg()[0],
+            "frames": len(scene),
+            "gaussians": scene.index.segments[0].rows,
+            "dynamic": scene.index.segments[0].dynamic,
+            "raw_bits": raw_bits,
+            "rows": rows,
+        }
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(facts, indent=1) + "\n")
+    print(table(rows, raw_bits))
+
+
+if __name__ == "__main__":
+    main()

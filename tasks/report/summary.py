@@ -1,0 +1,40 @@
+"""The figures of a run that one quotes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tasks.report.facts import LEVELS, FrameScore, ReportInput, by_camera, mean_of, still_trend
+
+
+def summary(report: ReportInput) -> dict[str, Any]:
+    """The figures that one quotes; None where there is none. Means run over cameras first, then over frames."""
+    cameras = by_camera(report.scores)
+    scene, rig = report.scene, report.rig
+    work = sum(stage.seconds for stage in report.stages) if report.stages else None
+    return {
+        "psnr_db": _mean([np.mean([score.level_db for score in own]) for own in cameras.values()]),
+        "ssim": _mean([np.mean([score.ssim for score in own]) for own in cameras.values()]),
+        **{f"psnr_{name}": _over_cameras(cameras, name) for name in LEVELS if name != "psnr_db"},
+        "still_trend_db": still_trend(report.scores),
+        **{name: _over_cameras(cameras, name) for name in ("tof_px", "flicker", "lpips")},
+        "scored_cameras": sorted(cameras),
+        "mb_per_30_frames": scene.mb_per_30_frames if scene else None,
+        "seconds": report.seconds if report.seconds is not None else work,
+        "peak_memory_bytes": max((s.peak_memory_bytes or 0 for s in report.stages), default=0) or None,
+        "frames": scene.frames if scene else None,
+        "cameras": len(rig.cameras) if rig else len(report.sync.cameras) if report.sync else None,
+        "held_out": list(report.held_out),
+        "verified": scene.verified if scene else None,
+    }
+
+
+def _over_cameras(cameras: Mapping[str, Sequence[FrameScore]], name: str) -> float | None:
+    return _mean([value for own in cameras.values() if (value := mean_of(own, name)) is not None])
+
+
+def _mean(values: Sequence[Any]) -> float | None:
+    return float(np.mean(values)) if len(values) else None
