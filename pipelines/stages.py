@@ -20,7 +20,7 @@ from pipelines.chain import Chain, Epoch, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
-from sync.capture import find_capture, find_masks, find_plate
+from sync.capture import check_masks, find_capture, find_masks, find_plate
 from sync.clock import ClockMode
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
@@ -44,7 +44,7 @@ from tasks.stages.masks import CheckMasks
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.scale import ScaleRig, known_of
-from tasks.stages.synchronize import synchronize
+from tasks.stages.synchronize import read_videos, synchronize
 from tasks.stages.track import (
     RAFT,
     ChooseDatedKeyframes,
@@ -158,11 +158,14 @@ class Sequence:
         )
 
     def _synchronize(self) -> None:
-        find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
+        capture = find_capture(self.plan.capture)
+        find_plate(capture)  # whose absence should not show hours later
+        find_masks(capture)  # likewise
         options, starts = self.options, None
         if options.sync.clock is ClockMode.CONTENT:
             starts = self._make(find_starts(self.workshop, options.motion, options.pictures.transfer))
         groups = self._make(synchronize(self.workshop, options.sync, starts))
+        check_masks(capture, read_videos(self.workshop.path(groups)))
         check_space(self.workshop, self.plan, self.options, groups)
         self.synchronized(groups)
 

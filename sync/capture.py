@@ -43,6 +43,8 @@ SHARED_TIMECODES = "timestamps.csv"
 SETTINGS = "capture.toml"
 MASKS = "masks"
 """Folder of foreground masks"""
+SHAPES_APART = 0.01
+"""By which the ratio of a mask's sides may differ from its camera's: sides are whole pixels"""
 SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
 TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10", "linear")
@@ -233,6 +235,9 @@ def find_masks(capture: Capture) -> dict[str, Path]:
     if not inside.is_dir():
         return {}
     found, ignored = _by_camera(inside, _cameras(inside)), capture.settings.ignore
+    folders = [path for path in inside.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    if empty := sorted(path for path in folders if not holds_pictures(path)):
+        raise ValueError(f"{empty[0]} must hold numbered masks, as 000000.png, but holds none; add them or take it out")
     if not found:
         raise ValueError(
             f"{inside} must hold masks as <camera>/000000.png or <camera>.mp4, but holds none; take it out"
@@ -244,14 +249,23 @@ def find_masks(capture: Capture) -> dict[str, Path]:
     return {camera: found[camera] for camera in capture.cameras if camera in found}
 
 
-def check_masks(capture: Capture, masks: Mapping[str, Path], frames: Mapping[str, int]) -> None:
-    """Raise ValueError unless each camera has as many masks as its video has `frames`, and with the same numbers."""
-    for camera, path in masks.items():
-        count = len(list_pictures(path)) if path.is_dir() else probe_video(path).frame_count
-        if count != frames[camera]:
+def check_masks(capture: Capture, videos: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise ValueError unless each camera with masks has as many as its video has frames, with the same numbers, and
+    the first of them has the shape of its pictures; `videos` says frames, width and height of each camera."""
+    for camera, path in find_masks(capture).items():
+        info, (frames, width, height) = (
+            probe_video(path),
+            (videos[camera][key] for key in ("frames", "width", "height")),
+        )
+        if info.frame_count != frames:
             raise ValueError(
-                f"{path} must have a mask for each of the {frames[camera]} frames of {camera}, but has {count}; add "
+                f"{path} must have a mask for each of the {frames} frames of {camera}, but has {info.frame_count}; add "
                 "those that are missing, or take it out"
+            )
+        if abs(info.width * height / (info.height * width) - 1) > SHAPES_APART:
+            raise ValueError(
+                f"{path} must have masks in the shape of the pictures of {camera}, {width}x{height}, but they are "
+                f"{info.width}x{info.height}; make them anew of these pictures, or take them out"
             )
         video = capture.videos[camera]
         if not (path.is_dir() and video.is_dir()):

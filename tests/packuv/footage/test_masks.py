@@ -20,8 +20,9 @@ def write_masks(folder: Path, masks: list[np.ndarray]) -> Path:
 
 
 @pytest.mark.parametrize("scale", [1, 2])
-def test_labels_are_foreground_in_the_size_of_the_pictures(tmp_path: Path, scale: int) -> None:
-    labels = np.random.default_rng(0).integers(0, 3, (24, 32), dtype=np.uint8)
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_labels_are_foreground_in_the_size_of_the_pictures(tmp_path: Path, scale: int, kind: type) -> None:
+    labels = np.random.default_rng(0).integers(0, 3, (24, 32)).astype(kind)
     reader = MaskReader({"a": write_masks(tmp_path / "a", [labels])}, {"a": (32 * scale, 24 * scale)})
     wanted = np.kron(labels > 0, np.ones((scale, scale), bool))
     assert np.array_equal(reader.read("a", 0)[:, :, 0] == 255, wanted)
@@ -40,9 +41,20 @@ def test_masks_belong_to_cameras_and_frames(tmp_path: Path) -> None:
     assert find_masks(find_capture(tmp_path)) == {}
     write_masks(tmp_path / "masks" / "a", [picture] * 2)
     capture = find_capture(tmp_path)
-    masks = find_masks(capture)
+    videos = {name: {"frames": 3, "width": 32, "height": 24} for name in "ab"}
     with pytest.raises(ValueError, match="a mask for each of the 3 frames of a, but has 2"):
-        check_masks(capture, masks, {"a": 3, "b": 3})
+        check_masks(capture, videos)
+    cv2.imwrite(str(tmp_path / "masks" / "a" / "000003.png"), picture)
+    with pytest.raises(ValueError, match="frame 2 is picture 2 and mask 3; number them alike"):
+        check_masks(capture, videos)
+    (tmp_path / "masks" / "a" / "000003.png").rename(tmp_path / "masks" / "a" / "000002.png")
+    check_masks(capture, videos)
+    with pytest.raises(ValueError, match="in the shape of the pictures of a, 48x24, but they are 32x24"):
+        check_masks(capture, {"a": {"frames": 3, "width": 48, "height": 24}})
+    (tmp_path / "masks" / "b").mkdir()
+    with pytest.raises(ValueError, match=r"b must hold numbered masks, as 000000\.png, but holds none"):
+        find_masks(capture)
+    (tmp_path / "masks" / "b").rmdir()
     write_masks(tmp_path / "masks" / "c", [picture] * 3)
     with pytest.raises(ValueError, match="belongs to no video"):
         find_masks(capture)
