@@ -247,7 +247,7 @@ def remains_in(folder: Path) -> Remains:
     return record
 
 
-SHOWN = ("sync", "rig", "light", "points", "content", "patches", "keyframes", "encode", "verify", "evaluate")
+SHOWN = ("sync", "rig", "light", "points", "content", "masks", "patches", "keyframes", "encode", "verify", "evaluate")
 """Stages whose artefacts a report reads"""
 
 

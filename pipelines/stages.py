@@ -237,10 +237,12 @@ class Sequence:
         )
 
     def _check_masks(self, take: Take, motion: Key) -> None:
-        masks = find_masks(self.workshop.capture)
-        if masks := {name: path for name, path in masks.items() if name in take.cameras}:
+        found = find_masks(self.workshop.capture)
+        if masks := {name: path for name, path in found.items() if name in take.cameras}:
             files = self.workshop.files(masks, "reading masks")
             self._make(CheckMasks(take=take, motion=motion, masks=files))
+        elif found:
+            self.workshop.listener.skipped("masks", f"no fitted camera has any, only {', '.join(found)}")
 
     def _patches(self, take: Take) -> Key | None:
         """What changes for good; None where nothing does, so that nothing depends on how that was found."""
