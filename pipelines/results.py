@@ -59,6 +59,7 @@ from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
 from tasks.stages.fitting import REFUSED
 from tasks.stages.footage import LIGHT, RIG
 from tasks.stages.light import read_damage, read_steady
+from tasks.stages.masks import doubts
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import FOOTAGE, read_videos
 from tasks.stages.track import read_curve, read_keyframes
@@ -246,7 +247,7 @@ def remains_in(folder: Path) -> Remains:
     return record
 
 
-SHOWN = ("sync", "rig", "light", "points", "content", "patches", "keyframes", "encode", "verify", "evaluate")
+SHOWN = ("sync", "rig", "light", "points", "content", "masks", "patches", "keyframes", "encode", "verify", "evaluate")
 """Stages whose artefacts a report reads"""
 
 
@@ -285,6 +286,7 @@ def collect(run: Remains) -> ReportInput:
         check=_check(run),
         evidence=_evidence(run.folder("points")),
         content=_content(run.folder("content")),
+        masks=_mask_doubts(run),
         footage=tuple(_footage_notes(run)),
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
         unlike=_points_notes(run).get("unlike", {}),
@@ -303,7 +305,7 @@ def collect(run: Remains) -> ReportInput:
 GROUPS = {
     **dict.fromkeys(("clock", "sync"), "sync"),
     **dict.fromkeys(("rig", "light", "points"), "calibrate"),
-    **dict.fromkeys(("motion", "content", "patches", "keyframes"), "flow"),
+    **dict.fromkeys(("motion", "content", "masks", "patches", "keyframes"), "flow"),
     **dict.fromkeys(("background", "backdrop", "key", "segment", "preview"), "fit"),
     **{name: name for name in ("encode", "verify", "evaluate")},
 }
@@ -394,6 +396,11 @@ def _footage_notes(run: Remains) -> Iterator[str]:
 
 def _content(folder: Path | None) -> Content | None:
     return read_content(folder) if folder else None
+
+
+def _mask_doubts(run: Remains) -> dict[str, str]:
+    masks = run.made.get("masks")
+    return doubts(run.store.receipt(masks).notes) if masks else {}
 
 
 def _points_notes(run: Remains) -> Mapping[str, Any]:

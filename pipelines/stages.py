@@ -20,7 +20,7 @@ from pipelines.chain import Chain, Epoch, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
-from sync.capture import find_capture, find_plate
+from sync.capture import check_masks, find_capture, find_masks, find_plate
 from sync.clock import ClockMode
 from tasks.artefacts.stage import Stage
 from tasks.artefacts.store import Key
@@ -40,10 +40,11 @@ from tasks.stages.fitting import (
 )
 from tasks.stages.footage import PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
+from tasks.stages.masks import CheckMasks
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.scale import ScaleRig, known_of
-from tasks.stages.synchronize import synchronize
+from tasks.stages.synchronize import read_videos, synchronize
 from tasks.stages.track import (
     RAFT,
     ChooseDatedKeyframes,
@@ -157,11 +158,14 @@ class Sequence:
         )
 
     def _synchronize(self) -> None:
-        find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
+        capture = find_capture(self.plan.capture)
+        find_plate(capture)  # whose absence should not show hours later
+        find_masks(capture)  # likewise
         options, starts = self.options, None
         if options.sync.clock is ClockMode.CONTENT:
             starts = self._make(find_starts(self.workshop, options.motion, options.pictures.transfer))
         groups = self._make(synchronize(self.workshop, options.sync, starts))
+        check_masks(capture, read_videos(self.workshop.path(groups)))
         check_space(self.workshop, self.plan, self.options, groups)
         self.synchronized(groups)
 
@@ -207,6 +211,7 @@ class Sequence:
         take, options = self._take("rig"), self.options
         motion = self._make(self._motion(take))
         self._compare(take, motion)
+        self._check_masks(take, motion)
         if patches := self._patches(take):
             self._make(ChooseDatedKeyframes(motion=motion, patches=patches, options=options.keyframes))
         else:
@@ -230,6 +235,14 @@ class Sequence:
                 take=take, unseen=unseen, motion=motion, motion_options=options.motion, options=options.content
             )
         )
+
+    def _check_masks(self, take: Take, motion: Key) -> None:
+        found = find_masks(self.workshop.capture)
+        if masks := {name: path for name, path in found.items() if name in take.cameras}:
+            files = self.workshop.files(masks, "reading masks")
+            self._make(CheckMasks(take=take, motion=motion, masks=files))
+        elif found:
+            self.workshop.listener.skipped("masks", f"no fitted camera has any, only {', '.join(found)}")
 
     def _patches(self, take: Take) -> Key | None:
         """What changes for good; None where nothing does, so that nothing depends on how that was found."""

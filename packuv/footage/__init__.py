@@ -3,6 +3,7 @@
 from packuv.footage.damage import DamageLog, damage_told, without
 from packuv.footage.lens import LensCamera
 from packuv.footage.light import Light, LightOptions, measure_light
+from packuv.footage.masks import MaskReader, foreground
 from packuv.footage.planes import as_planes
 from packuv.footage.reader import FrameReader
 from packuv.footage.response import Response
@@ -17,12 +18,14 @@ __all__ = [
     "LensCamera",
     "Light",
     "LightOptions",
+    "MaskReader",
     "Response",
     "Transfer",
     "Views",
     "WatchingReader",
     "as_planes",
     "damage_told",
+    "foreground",
     "looks_like_log",
     "measure_light",
     "without",

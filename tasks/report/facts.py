@@ -289,6 +289,8 @@ class ReportInput:
     evidence: Mapping[str, CameraEvidence] = field(default_factory=dict)
     """By camera; empty where no points were triangulated"""
     content: Content | None = None
+    masks: Mapping[str, str] = field(default_factory=dict)
+    """Fitted cameras whose foreground masks are not to be believed, and why"""
     footage: tuple[str, ...] = ()
     """What was read of the videos and what was not, where it is not plain, and which pictures are damaged"""
     colours: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

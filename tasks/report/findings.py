@@ -57,6 +57,7 @@ def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...
         *_rig_findings(report, limits),
         *_light_findings(report, limits),
         *_motion_findings(report),
+        *_mask_findings(report),
         *_score_findings(report, limits),
         *_scene_findings(report, limits),
     )
@@ -234,6 +235,17 @@ def _motion_findings(report: ReportInput) -> Iterator[Finding]:
             "motion",
             f"{text}; if the scene is cut there, process the parts apart with --frames.",
             cure=f"If it is cut, run with --frames :{instant} and --frames {instant}: instead.",
+        )
+
+
+def _mask_findings(report: ReportInput) -> Iterator[Finding]:
+    for name, why in report.masks.items():
+        yield Finding(
+            "motion",
+            f"Masks of {name}: {why}.".replace("?.", "?"),
+            cure="Lay a mask over the picture of its number; make the masks anew, or take them out of masks/.",
+            camera=name,
+            many="cameras have masks that do not fit what moves",
         )
 
 

@@ -19,6 +19,7 @@ from packuv.footage import (
     FrameReader,
     LensCamera,
     Light,
+    MaskReader,
     Transfer,
     Views,
     WatchingReader,
@@ -164,6 +165,15 @@ class Footage:
         lenses = [lens_camera(rig[name]) for name in videos]
         pictures = self.take.pictures
         return Views(videos, frames, lenses, max_width=pictures.max_width, transfer=pictures.transfer, reader=reader)
+
+    def open_masks(self, masks: Mapping[str, Path]) -> Views:
+        """Foreground masks of some of this take's cameras, laid over the pictures that `open_views` gives; see
+        `packuv.footage.foreground`."""
+        rig, groups = self.load_rig(), self.load_groups()
+        sizes = {name: (rig[name].width, rig[name].height) for name in masks}
+        frames = groups.frames[:, [groups.cameras.index(name) for name in masks]]
+        lenses = [lens_camera(rig[name]) for name in masks]
+        return Views(masks, frames, lenses, max_width=self.take.pictures.max_width, reader=MaskReader(masks, sizes))
 
     def filmed(self, instant: int) -> dict[str, np.ndarray]:
         """Pictures as filmed, uint8 [H, W, 3] RGB, of the cameras that have one at this instant of the take."""

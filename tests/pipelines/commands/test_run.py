@@ -16,9 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
-from pipelines.cli import FAILED, OK, main
+from pipelines.cli import FAILED, OK, WRONG, main
 from pipelines.commands import run as command
 from pipelines.results import WHOLE, check_whole
 from tasks.artefacts.store import Store
@@ -174,3 +176,21 @@ def test_a_whole_run_has_all_its_files(tmp_path, monkeypatch, capsys, lost):
     assert main([*asked, "--stop-after", "flow"]) == OK
     assert main(asked) == FAILED
     assert f"{tmp_path / lost} is not there" in capsys.readouterr().err
+
+
+def test_masks_that_do_not_fit_their_camera_end_a_run_before_any_work(tmp_path, capsys):
+    capture = shutil.copytree(CAPTURE, tmp_path / "capture")
+    picture = np.zeros((4, 4), np.uint8)
+    masks = capture / "masks" / "cam03"  # which is held out
+    masks.mkdir(parents=True)
+    cv2.imwrite(str(masks / "000000.png"), picture)
+    out = tmp_path / "out"
+    asked = ["run", str(capture), "--out", str(out), "--preset", "draft", "--hold-out", "cam03", "--direct"]
+
+    assert main(asked) == WRONG
+    assert "cam03 must have a mask for each of the" in capsys.readouterr().err
+    (made,) = out.iterdir()
+    assert [path.name for path in (made / "store").iterdir() if path.is_dir() and path.name[0] != "."] == ["sync"]
+    masks.rename(masks.with_name("cam33"))
+    assert main(asked) == WRONG
+    assert "cam33 belongs to no video; did you mean 'cam03'?" in capsys.readouterr().err

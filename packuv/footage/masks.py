@@ -1,0 +1,69 @@
+"""Foreground masks that come beside the footage: what is a person or thing, by camera and frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from packuv.footage.pictures import picture_names
+from packuv.footage.reader import FrameReader
+
+SHAPES_APART = 0.01
+"""By which the ratio of a mask's sides may differ from its camera's: sides are whole pixels"""
+HALF = 128
+
+
+class MaskReader(FrameReader):
+    """Masks by camera and number of the frame, in the size of the camera's pictures.
+
+    In PNG all but 0 is foreground, so labels are, too; codecs that lose something blur the border, so in JPEG and video
+    it is what is at least half white.
+    """
+
+    def __init__(self, masks: Mapping[str, Path], sizes: Mapping[str, tuple[int, int]]) -> None:
+        """`sizes` are widths and heights of the cameras' pictures."""
+        super().__init__(masks)
+        self._sizes = sizes
+        self._labels = {name: _labels(path) for name, path in self.videos.items()}
+
+    def read(self, camera: str, frame: int) -> np.ndarray:
+        """uint8 [H, W, 3], 255 in the foreground and 0 elsewhere.
+
+        Raises what FrameReader does, and ValueError for a mask of another shape than the camera's pictures.
+        """
+        pixels, (width, height) = self._raw(camera, frame), self._sizes[camera]
+        own_height, own_width = pixels.shape[:2]
+        if abs(own_width * height / (own_height * width) - 1) > SHAPES_APART:
+            raise ValueError(
+                f"{self.videos[camera]} must have masks in the shape of the pictures of {camera}, {width}x{height}, "
+                f"but mask {frame} is {own_width}x{own_height}; make them anew of these pictures, or take them out"
+            )
+        mask = np.where(pixels.max(axis=2, keepdims=True) >= (1 if self._labels[camera] else HALF), 255, 0).astype(
+            np.uint8
+        )
+        resized = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
+        return np.repeat(resized[:, :, None], 3, axis=2)
+
+    def _raw(self, camera: str, frame: int) -> np.ndarray:
+        """[H, W, C] without alpha; of PNG the values in the file, since 16 bits rounded to 8 lose small labels."""
+        if not (names := self._labels[camera]):
+            return super().read(camera, frame)
+        path = self.videos[camera] / names[frame]
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if pixels is None:
+            raise ValueError(f"{path} cannot be decoded; copy it again")
+        return np.asarray(np.atleast_3d(pixels)[:, :, :3])
+
+
+def foreground(pixels: np.ndarray) -> np.ndarray:
+    """bool [H, W] of a mask as `Views` undistort and scale it, uint8 [H, W, 3]: at least half of the pixel."""
+    return np.asarray(pixels[:, :, 0] >= HALF)
+
+
+def _labels(path: Path) -> list[str]:
+    """Names of PNG files by frame; none where masks are JPEG or video."""
+    names = picture_names(path) if path.is_dir() else []
+    return names if names and names[0].lower().endswith(".png") else []
