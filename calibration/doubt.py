@@ -40,11 +40,13 @@ class DoubtOptions:
     """Matches with which a pair speaks for its cameras, where most of them fit: chance ones never do"""
     fitting: float = 0.6
     """Share of them that must"""
-    alibis: int = 3
-    """Pairs that clear a camera, whatever others say, if nearly all of their many matches fit: chance lets two cameras
-    that see little in common agree on a geometry of its own, never three on the given one"""
-    alibi_matches: int = 100
-    alibi_fitting: float = 0.9
+    alibis: int = 2
+    """Pairs that clear a camera, whatever others say, if many of their matches fit to a fraction of a pixel: patterns
+    that repeat let cameras far apart agree on a geometry of its own, never two on the given one"""
+    alibi_matches: int = 60
+    """Matches of such a pair that fit, and ..."""
+    alibi_fitting: float = 0.5
+    """... share of all its matches; those that repeat are among them"""
     better: float = 0.6
     """Share of the median distance that other lenses leave at most, to be believed"""
     noise_px: float = 0.15
@@ -70,8 +72,11 @@ def doubts(
     if report.verdict is Verdict.UNDECIDED:
         return {WHOLE: f"is neither confirmed nor refuted by the pictures: {report.reason}"}
     pairs = _medians_px(rig, evidence, judge.min_matches)
+    cleared = _cleared(rig, evidence, options)
     known = _confirming_px(rig, evidence, judge, options) | pairs
-    off, left = _peeled(rig, known, _cleared(rig, evidence, judge, options), options)
+    limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
+    chance = {key for key, px in known.items() if key <= cleared and px > limit}
+    off, left = _peeled(rig, {key: px for key, px in known.items() if key not in chance}, cleared, options)
     found = {name: f"lies {px:.1f} px off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
              for name, px in off.items()}  # fmt: skip
     standings, moved = find_moved(rig, evidence)
@@ -82,9 +87,12 @@ def doubts(
             f"stands elsewhere than the calibration says: its picture lies {where.offset_px:.1f} px off, as if it were "
             f"turned by {where.turned_deg:.1f} degrees and shifted by {100 * where.shifted:.1f} % of the rig's radius",
         )
-    limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
     kept = rig.select(name for name in rig.names if name not in off)
-    right = [pair for pair in evidence if not {pair.first, pair.second} & off.keys()]
+    right = [
+        pair
+        for pair in evidence
+        if not {pair.first, pair.second} & off.keys() and frozenset((pair.first, pair.second)) not in chance
+    ]
     if better := _better_lens(kept, right, judge.min_matches, options):
         found[WHOLE] = f"fits the pictures better with {better}: its lenses are not those of these videos"
     elif left and _usual(left) > limit:
@@ -127,15 +135,13 @@ def _errors_px(rig: Rig, evidence: Sequence[PairMatches]) -> dict[frozenset[str]
     return {key: np.concatenate(found) for key, found in errors.items()}
 
 
-def _cleared(rig: Rig, evidence: Sequence[PairMatches], judge: MatchOptions, options: DoubtOptions) -> set[str]:
-    """Cameras with an alibi: several others confirm them beyond doubt."""
-    sure = [
-        key
-        for key, found in _errors_px(rig, evidence).items()
-        if len(found) >= options.alibi_matches
-        and (found <= judge.max_error_px).mean() >= options.alibi_fitting
-        and np.median(found) <= min(options.limit_px(rig[name].width) for name in key)
-    ]
+def _cleared(rig: Rig, evidence: Sequence[PairMatches], options: DoubtOptions) -> set[str]:
+    """Cameras with an alibi: others confirm them beyond doubt. What two of them have against each other is chance."""
+    sure = []
+    for key, found in _errors_px(rig, evidence).items():
+        fits = found <= min(options.limit_px(rig[name].width) for name in key)
+        if fits.sum() >= options.alibi_matches and fits.mean() >= options.alibi_fitting:
+            sure.append(key)
     return {name for name in rig.names if sum(name in key for key in sure) >= options.alibis}
 
 

@@ -99,6 +99,19 @@ def test_a_right_calibration_is_not_doubted(right, evidence):
     assert found(right, evidence) == {}
 
 
+def test_walls_that_look_alike_accuse_nobody_whom_two_others_confirm(right, evidence):
+    """Many pairs far apart match one brick wall with another, on a geometry of its own, more often than themselves."""
+    alike = []
+    for number, pair in enumerate(evidence):
+        if abs(int(pair.first[3:]) - int(pair.second[3:])) > 2:
+            shifted = replace(pair, second_pixels=pair.second_pixels + np.array([0, 30 + 5 * number]))
+            alike += [shifted, shifted, shifted]
+    assert len(alike) >= 9
+    assert found(right, [*evidence, *alike]) == {}
+    change, named = FAULTS["turned about x"]
+    assert named in found(change(right), [*evidence, *alike])
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_planted_fault_is_named(right, evidence, fault):
     change, named = FAULTS[fault]
