@@ -29,7 +29,7 @@ from pipelines.options import SequenceOptions, check_raft, compose
 from pipelines.probe import remembered
 from pipelines.register import Place, bury, registered
 from pipelines.request import RunRequest
-from pipelines.results import Ending, Run, collect, ending_of, remains, run_json
+from pipelines.results import REPORT, Ending, Run, collect, ending_of, remains, run_json
 from pipelines.stages import Made, Sequence
 from sync.capture import Capture, check_name, find_capture
 from tasks.artefacts.jobs import CancelledError, JobError, Jobs
@@ -386,11 +386,11 @@ def _publish(run: Run, folder: Path) -> Outcome:
         scene = folder / SCENE
         place(run.workshop.path(key) / SCENE, scene)
         (folder / PARTIAL).unlink(missing_ok=True)
-    run.journal.started("report")
+    run.journal.started(REPORT)
     content = collect(remains(run))
     limits = run.options.report
     report = write_report(content, folder, limits=limits)
-    run.journal.ended("report")
+    run.journal.ended(REPORT)
     events, found = tuple(run.journal.events), findings(content, limits)
     judged = verdict(content, limits, found)
     return Outcome(folder, scene, report.page, summary(content), events, found, judged, content.choice)

@@ -200,6 +200,8 @@ def remains(run: Run) -> Remains:
     )
 
 
+REPORT = "report"
+"""What writing it is called among the stages of a run; a report does not tell of itself"""
 PACKAGES = ("torch", "torchcodec", "numpy", "numba", "av", "opencv-python-headless", "pycolmap", "prefect", "gsplat")
 """Whose versions may change results, or how long they take"""
 
@@ -235,7 +237,7 @@ def remains_in(folder: Path) -> Remains:
             held_out=tuple(told["cameras"]["held_out"]),
             store=store,
             made=made,
-            events=[event_of(stage) for stage in told["stages"]],
+            events=[event_of(stage) for stage in told["stages"] if stage["stage"] != REPORT],
             choice=restore(Choice | None, told["choice"]),
             forecast=restore(Forecast | None, told["forecast"]),
         )
@@ -447,4 +449,4 @@ def _pictures(folder: Path | None) -> Iterator[Comparison]:
 def _stage(store: Store, event: Event) -> StageRecord:
     there = event.key is not None and store.holds(event.key)  # what another take lends lies in a store of its own
     memory = store.receipt(event.key).peak_memory_bytes if event.key and there else None
-    return StageRecord(event.label, event.outcome, event.seconds, memory, event.reason)  # type: ignore[arg-type]  # StageRecord checks the outcome
+    return StageRecord(event.label, event.outcome, round(event.seconds, 3), memory, event.reason)  # type: ignore[arg-type]  # StageRecord checks the outcome
