@@ -15,7 +15,7 @@ from pipelines.cli import main
 from pipelines.join import join
 from sync.capture import find_capture
 from sync.probe import probe_video
-from tests.support.needs import needs_ffmpeg
+from tests.support.needs import need, needs_ffmpeg
 
 pytestmark = needs_ffmpeg
 
@@ -196,8 +196,8 @@ def test_two_files_of_one_chapter_are_refused_by_name(tmp_path: Path, capsys: py
 
 def test_another_disk_is_noticed_before_anything_is_written(tmp_path: Path) -> None:
     other = Path("/dev/shm")
-    if not other.is_dir() or other.stat().st_dev == tmp_path.stat().st_dev:
-        pytest.skip("needs a second file system at /dev/shm")
+    apart = other.is_dir() and other.stat().st_dev != tmp_path.stat().st_dev
+    need("shm", apart, "no second file system at /dev/shm")
     record(tmp_path / "videos" / "cam1", ("GX010042.MP4", "GX020042.MP4", "GX030042.MP4"))
     with TemporaryDirectory(dir=other) as elsewhere:
         (tmp_path / "chapters").symlink_to(elsewhere)
