@@ -71,9 +71,9 @@ def doubts(
     """
     if report.verdict is Verdict.UNDECIDED:
         return {WHOLE: f"is neither confirmed nor refuted by the pictures: {report.reason}"}
-    pairs = _medians_px(rig, evidence, judge.min_matches)
-    cleared = _cleared(rig, evidence, options)
-    known = _confirming_px(rig, evidence, judge, options) | pairs
+    errors = _errors_px(rig, evidence)
+    cleared = _cleared(rig, errors, options)
+    known = _confirming_px(errors, judge, options) | _medians_px(errors, judge.min_matches)
     limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
     chance = {key for key, px in known.items() if key <= cleared and px > limit}
     off, left = _peeled(rig, {key: px for key, px in known.items() if key not in chance}, cleared, options)
@@ -109,20 +109,20 @@ WRONG = "its pose, focal length, principal point or distortion is wrong, or its 
 
 Medians = Mapping[frozenset[str], float]
 """By pair of cameras, median Sampson distance of its matches, pixels"""
+Errors = Mapping[frozenset[str], np.ndarray]
+"""Likewise, of each match, float64 [K]"""
 
 
-def _medians_px(rig: Rig, evidence: Sequence[PairMatches], least: int) -> dict[frozenset[str], float]:
+def _medians_px(errors: Errors, least: int) -> dict[frozenset[str], float]:
     """Of the pairs that have so many matches at least."""
-    return {key: float(np.median(found)) for key, found in _errors_px(rig, evidence).items() if len(found) >= least}
+    return {key: float(np.median(found)) for key, found in errors.items() if len(found) >= least}
 
 
-def _confirming_px(
-    rig: Rig, evidence: Sequence[PairMatches], judge: MatchOptions, options: DoubtOptions
-) -> dict[frozenset[str], float]:
+def _confirming_px(errors: Errors, judge: MatchOptions, options: DoubtOptions) -> dict[frozenset[str], float]:
     """Of the pairs that speak for their cameras."""
     return {
         key: float(np.median(found))
-        for key, found in _errors_px(rig, evidence).items()
+        for key, found in errors.items()
         if len(found) >= options.confirming and (found <= judge.max_error_px).mean() >= options.fitting
     }
 
@@ -135,10 +135,10 @@ def _errors_px(rig: Rig, evidence: Sequence[PairMatches]) -> dict[frozenset[str]
     return {key: np.concatenate(found) for key, found in errors.items()}
 
 
-def _cleared(rig: Rig, evidence: Sequence[PairMatches], options: DoubtOptions) -> set[str]:
+def _cleared(rig: Rig, errors: Errors, options: DoubtOptions) -> set[str]:
     """Cameras with an alibi: others confirm them beyond doubt. What two of them have against each other is chance."""
     sure = []
-    for key, found in _errors_px(rig, evidence).items():
+    for key, found in errors.items():
         fits = found <= min(options.limit_px(rig[name].width) for name in key)
         if fits.sum() >= options.alibi_matches and fits.mean() >= options.alibi_fitting:
             sure.append(key)
@@ -171,16 +171,16 @@ def _peeled(
 
 def _better_lens(rig: Rig, evidence: Sequence[PairMatches], least: int, options: DoubtOptions) -> str:
     """What all lenses would have in common with which the pictures agree far better; empty where nothing does."""
-    now = _usual(_medians_px(rig, evidence, least))
+    now = _usual(_medians_px(_errors_px(rig, evidence), least))
     if now <= options.noise_px:
         return ""
     tried = {
-        f"focal lengths of {scale:.0%}": _usual(_medians_px(_with_focal(rig, scale), evidence, least))
+        f"focal lengths of {scale:.0%}": _usual(_medians_px(_errors_px(_with_focal(rig, scale), evidence), least))
         for scale in FOCAL_SCALES
     }
     if not any(camera.fisheye for camera in rig.cameras):
         tried |= {
-            f"k1 of {bend:+.2f} beside theirs": _usual(_medians_px(_with_bend(rig, bend), evidence, least))
+            f"k1 of {bend:+.2f} beside theirs": _usual(_medians_px(_errors_px(_with_bend(rig, bend), evidence), least))
             for bend in BENDS
         }
     best = min(tried, key=lambda name: tried[name])
