@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,20 +17,28 @@ from typing import Any
 import numpy as np
 
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, SCALE, Codes, Quantizer, attribute_values
-from packuv.gaussians.floats import Gaussians, drawn, rows_of, with_canonical_axes
+from packuv.gaussians.floats import DRAWN_LOGIT, SH_C0, Gaussians, drawn, opacity, rows_of, with_canonical_axes
 from packuv.gaussians.rows import first_appearance, with_rows
 from packuv.gaussians.segment import Segment
 from packuv.gaussians.uvmap import assign_slots, choose_centre
 from packuv.gaussians.uvsize import UvOptions
-from packuv.interchange import is_splats, read_gaussians
+from packuv.interchange import antialiased, is_splats, read_gaussians
 from packuv.interchange.joined import equal_codes, segments_of
-from packuv.interchange.orbit import OrbitOptions, likeness, near_of, orbit
+from packuv.interchange.orbit import OrbitOptions, around, likeness, middle, near_of, orbit
 from packuv.progress import Progress, no_progress, part_of
 from packuv.scene import SceneHeader, open_scene, write_scene
 
-TAIL = 5e-5
-"""Share of the values at either end of a column that its range need not hold; one stray value would coarsen all. With
-ten times as much, pictures of a fitted scene came 6 to 20 dB worse."""
+TAILS = (5e-5, 5e-4, 5e-3, 0.01, 0.02)
+"""Shares of the values at either end of a column that its range need not hold; one stray value would coarsen all. The
+first, unless the column has more strays: with ten times as much, pictures of a fitted scene came 6 to 20 dB worse."""
+STRAY_GAIN = 4.0
+"""A wider tail must make the squared error of a column so many times smaller"""
+SEEN = 1 / SH_C0
+"""The most that a value beyond the range of its code is wrong to the eye: of SH, from black to white"""
+SEEN_LOG_SCALE = 1.0
+"""The same of a log scale"""
+ANTIALIASED = "antialiased"
+"""Field of a header's `extra`: trained with the opacities of Mip-Splatting"""
 ROTATION_REACH = 0.7072
 """x, y and z of a canonical rotation are at most the square root of one half."""
 
@@ -69,14 +77,20 @@ class AdoptReport:
     """Size of the scene file"""
     gaussians: int
     """Of all frames together, in the files"""
-    undrawn: int
-    """Of these, broken (not finite, or without a rotation) or fainter than any renderer draws"""
+    broken: int
+    """Of these, without a place, size, colour or rotation: what is not finite; they are lost"""
+    faint: int
+    """Of these, fainter than any renderer draws"""
     pruned: int
     """Of the rest, for which the UV map had no texel"""
     kept_share: float
-    """Share of the drawn Gaussians that the scene holds"""
+    """Share of all but the faint ones that the scene holds"""
     kept_alpha_share: float
-    """The same, each counted by its alpha"""
+    """The same, each counted by its alpha, and by 1 where that is unknown"""
+    antialiased: bool
+    """Whether the files ask for the opacities of Mip-Splatting, which are kept as a mark and not drawn"""
+    empty: int
+    """Frames without any Gaussian that is drawn"""
     saturated: int
     """Values of the first frame beyond the range of their codes"""
     psnr_pruned_db: tuple[float, ...]
@@ -122,8 +136,8 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress: Progress = no_progress) -> AdoptReport:
     """Write a scene file of splat files, one a frame, and tell what was lost.
 
-    Every file is read twice, at most one segment is in memory. Raises ValueError for files without a drawn Gaussian or
-    of different SH degrees, FileNotFoundError for missing ones.
+    Every file is read twice, at most one segment is in memory. A frame may be empty. Raises ValueError for files
+    without any drawn Gaussian or of different SH degrees, FileNotFoundError for missing ones.
     """
     if not out.parent.is_dir():
         raise FileNotFoundError(f"no folder {out.parent} to write {out.name} in; make it first")
@@ -132,6 +146,8 @@ def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress:
     for done, path in enumerate(frames, start=1):
         survey.add(path)
         progress(done, steps)
+    if not survey.spheres:
+        raise ValueError(f"{frames[0]} holds no Gaussians that can be drawn, nor does any other file of {len(frames)}")
     header = _header(survey, frames, options)
     mapper = _Mapper(header.quantizer, options)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}.") as folder:
@@ -142,16 +158,19 @@ def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress:
             mapper.keep(segment).save(parts[-1])
         summary = write_scene(out, parts, header, progress=part_of(progress, 2 * count, steps))
     pruned, finished = _compare(frames, out, options)
-    drawn_count = survey.count - survey.undrawn
+    wanted = survey.count - survey.faint
     return AdoptReport(
         frames=count,
         segments=len(parts),
         bytes=summary.bytes,
         gaussians=survey.count,
-        undrawn=survey.undrawn,
-        pruned=drawn_count - mapper.kept,
-        kept_share=mapper.kept / drawn_count,
-        kept_alpha_share=mapper.kept_alpha / mapper.alpha,
+        broken=survey.broken,
+        faint=survey.faint,
+        pruned=wanted - survey.broken - mapper.kept,
+        kept_share=mapper.kept / wanted,
+        kept_alpha_share=mapper.kept_alpha / (mapper.alpha + survey.broken_alpha),
+        antialiased=survey.antialiased,
+        empty=survey.empty,
         saturated=header.quantizer.saturation(survey.first),
         psnr_pruned_db=tuple(pruned),
         psnr_db=tuple(finished),
@@ -160,23 +179,39 @@ def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress:
 
 def _header(survey: _Survey, frames: Sequence[Path], options: AdoptOptions) -> SceneHeader:
     """Ranges of all frames, regular times, and the cameras of the orbit."""
-    cameras = orbit(survey.first, options=options.orbit)
+    cameras = orbit(*around(survey.spheres), options=options.orbit)
     times = np.array([round(index * 10**9 / options.rate) for index in range(len(frames))], dtype=np.int64)
     source = {"files": len(frames), "first": frames[0].name, "uv": None if options.uv is None else vars(options.uv)}
     extra = {"near": near_of(cameras), "adopted": source}
+    if survey.antialiased:
+        extra[ANTIALIASED] = True
     return SceneHeader(survey.quantizer(), times, options.rate, cameras, extra=extra)
 
 
-@np.errstate(invalid="ignore")  # broken values are counted, not computed with
-def read_frame(path: Path, *, sh_degree: int | None) -> tuple[Gaussians, int]:
-    """The Gaussians of a file that a renderer draws, in canonical form, and the number of the others."""
-    whole = read_gaussians(path)
-    if sh_degree is not None and whole.sh_degree > sh_degree:
-        whole = replace(whole, sh=np.ascontiguousarray(whole.sh[:, : (sh_degree + 1) ** 2]))
-    values = (whole.means, whole.log_scales, whole.quaternions, whole.opacity_logits[:, None], whole.sh)
+@dataclass(frozen=True)
+class Frame:
+    """What a file holds."""
+
+    gaussians: Gaussians
+    """Those that a renderer draws, in canonical form"""
+    broken: int
+    broken_alpha: float
+    """Sum of the alphas of what is broken, 1 where it is unknown"""
+    faint: int
+
+
+@np.errstate(invalid="ignore", over="ignore")  # broken values are counted, not computed with
+def read_frame(path: Path, *, sh_degree: int | None) -> Frame:
+    """The Gaussians of a file, and the number of those that are not drawn."""
+    whole = read_gaussians(path, sh_degree=sh_degree)
+    values = (whole.means, whole.log_scales, whole.quaternions, whole.sh)
     sound = np.logical_and.reduce([np.isfinite(v).all(axis=tuple(range(1, v.ndim))) for v in values])
-    kept = drawn(rows_of(whole, sound & whole.quaternions.any(axis=1)))
-    return with_canonical_axes(kept), len(whole) - len(kept)
+    sound &= whole.quaternions.any(axis=1) & ~np.isnan(whole.opacity_logits)
+    kept, lost = drawn(rows_of(whole, sound)), rows_of(whole, ~sound)
+    seen = np.isnan(lost.opacity_logits) | (lost.opacity_logits >= DRAWN_LOGIT)  # what is faint is not missed
+    alpha = np.nan_to_num(opacity(lost)[seen], nan=1.0)
+    broken = int(seen.sum())
+    return Frame(with_canonical_axes(kept), broken, float(alpha.sum()), len(whole) - len(kept) - broken)
 
 
 class _Survey:
@@ -185,19 +220,29 @@ class _Survey:
     def __init__(self, options: AdoptOptions) -> None:
         self._options = options
         self.first: Gaussians
-        self.count = self.undrawn = 0
+        self.spheres: list[tuple[np.ndarray, float]] = []
+        """Centre and radius of what each frame draws"""
+        self.count = self.broken = self.faint = self.empty = 0
+        self.broken_alpha = 0.0
+        self.antialiased = False
         self._low = self._high = np.empty(0)
         self._least = self._most = np.empty(0)
 
     def add(self, path: Path) -> None:
-        frame, undrawn = read_frame(path, sh_degree=self._options.sh_degree)
+        found = read_frame(path, sh_degree=self._options.sh_degree)
+        frame = found.gaussians
+        self.count += len(frame) + found.broken + found.faint
+        self.broken, self.faint = self.broken + found.broken, self.faint + found.faint
+        self.broken_alpha += found.broken_alpha
+        self.antialiased |= antialiased(path)
         if not len(frame):
-            raise ValueError(f"{path} holds no Gaussians that can be drawn; leave it out")
+            self.empty += 1
+            return
         values = attribute_values(frame)
-        low, high = np.quantile(values, [TAIL, 1 - TAIL], axis=0)
+        low, high = _range(values)
         high[SCALE] = values[:, SCALE].max(axis=0)  # the few largest Gaussians cover much of the picture
         least, most = frame.means.min(axis=0), frame.means.max(axis=0)
-        if not self.count:
+        if not self.spheres:
             self.first, self._low, self._high, self._least, self._most = frame, low, high, least, most
         elif len(low) != len(self._low):
             raise ValueError(
@@ -206,11 +251,10 @@ class _Survey:
             )
         self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
         self._least, self._most = np.minimum(self._least, least), np.maximum(self._most, most)
-        self.count += len(frame) + undrawn
-        self.undrawn += undrawn
+        self.spheres.append(middle(frame, share=self._options.orbit.share))
 
     def quantizer(self) -> Quantizer:
-        """Ranges that hold all but the tails; the axes of the scale share one, the colours of an SH coefficient too."""
+        """Ranges that hold all but strays; the axes of the scale share one, the colours of an SH coefficient too."""
         low, high = self._low.astype(np.float64), self._high.astype(np.float64)
         for group in (slice(0, 3), *(slice(k, k + 3) for k in range(OPACITY + 1, len(low), 3))):
             low[group], high[group] = low[group].min(), high[group].max()
@@ -228,15 +272,44 @@ class _Survey:
         return choose_centre(self.first.means, alpha, options=self._options.uv or UvOptions())
 
 
+def _range(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the range of each column [A] of values [n, A]: all but a tail, a longer one where strays are in it.
+
+    An end is the one of `TAILS` whose codes have the least squared error, counted up to what can be seen.
+    """
+    reach = np.full(values.shape[1], SEEN)
+    reach[SCALE] = SEEN_LOG_SCALE
+    ends = np.quantile(values, [*TAILS, *(1 - tail for tail in TAILS)], axis=0)  # [2 T, A]
+    lows, highs = ends[: len(TAILS)], ends[len(TAILS) :]
+    beyond = [
+        np.stack([np.square(np.clip(side * (end - values), 0, reach)).mean(axis=0) for end in tail])
+        for side, tail in ((1, lows), (-1, highs))
+    ]
+    steps = np.square(highs[None] - lows[:, None]) / (255**2 * 12)  # [T, T, A]: low, high
+    errors = (steps + beyond[0][:, None] + beyond[1][None]).reshape(-1, values.shape[1])
+    best = np.where(errors.min(axis=0) * STRAY_GAIN < errors[0], errors.argmin(axis=0), 0)
+    low, high = np.divmod(best, len(TAILS))
+    columns = np.arange(values.shape[1])
+    return lows[low, columns], highs[high, columns]
+
+
 def _coded(
     frames: Sequence[Path], quantizer: Quantizer, options: AdoptOptions, progress: Callable[[int], None]
 ) -> Iterator[Codes]:
-    """Second pass: the codes of every frame. A drawn Gaussian never gets opacity code 0, which means absent."""
+    """Second pass: the codes of every frame. A drawn Gaussian never gets opacity code 0, which means absent.
+
+    An empty frame is one absent Gaussian.
+    """
     for done, path in enumerate(frames, start=1):
-        codes = quantizer.encode(read_frame(path, sh_degree=options.sh_degree)[0])
-        codes.attributes[:, OPACITY] = np.maximum(codes.attributes[:, OPACITY], 1)
-        yield codes
+        codes = _drawn_codes(quantizer, read_frame(path, sh_degree=options.sh_degree).gaussians)
+        yield codes if len(codes) else Codes(np.zeros((1, 3), np.uint16), np.zeros((1, len(quantizer.low)), np.uint8))
         progress(done)
+
+
+def _drawn_codes(quantizer: Quantizer, gaussians: Gaussians) -> Codes:
+    codes = quantizer.encode(gaussians)
+    codes.attributes[:, OPACITY] = np.maximum(codes.attributes[:, OPACITY], 1)
+    return codes
 
 
 class _Mapper:
@@ -265,12 +338,12 @@ class _Mapper:
         still, moving = rows[~segment.dynamic], rows[segment.dynamic]
         base = segment.key.attributes[~segment.dynamic, OPACITY]
         changing = segment.key.attributes[None, segment.dynamic, OPACITY]
-        for opacity, kept, times in (
+        for codes, kept, times in (
             (base[None], still, len(segment)),
             (np.concatenate([changing, segment.attributes[:, :, OPACITY]]), moving, 1),
         ):
-            alpha = self._alpha[opacity]
-            self.kept += times * int((opacity[:, kept] > 0).sum())
+            alpha = self._alpha[codes]
+            self.kept += times * int((codes[:, kept] > 0).sum())
             self.kept_alpha += times * float(alpha[:, kept].sum())
             self.alpha += times * float(alpha.sum())
 
@@ -284,7 +357,7 @@ def _compare(frames: Sequence[Path], out: Path, options: AdoptOptions) -> tuple[
     with open_scene(out) as scene:
         near = scene.header.near
         for frame in np.unique(np.linspace(0, len(frames) - 1, options.compared_frames).round().astype(int)):
-            truth, _ = read_frame(frames[frame], sh_degree=options.sh_degree)
+            truth = read_frame(frames[frame], sh_degree=options.sh_degree).gaussians
             stored = scene.codes(int(frame))
             stored = stored[stored.attributes[:, OPACITY] > 0]
             quantizer, cameras = scene.header.quantizer, scene.header.cameras
@@ -295,6 +368,4 @@ def _compare(frames: Sequence[Path], out: Path, options: AdoptOptions) -> tuple[
 
 def _left_of(truth: Gaussians, stored: Codes, quantizer: Quantizer) -> Gaussians:
     """The Gaussians whose codes are stored, with the values that they had before."""
-    codes = quantizer.encode(truth)
-    codes.attributes[:, OPACITY] = np.maximum(codes.attributes[:, OPACITY], 1)
-    return rows_of(truth, np.flatnonzero(equal_codes(codes, stored) >= 0))
+    return rows_of(truth, np.flatnonzero(equal_codes(_drawn_codes(quantizer, truth), stored) >= 0))

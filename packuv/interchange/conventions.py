@@ -2,7 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+
+from packuv.gaussians.floats import Gaussians
+
+OPAQUE_LOGIT = 20.0
+"""For an alpha of 1, which has no finite logit: float32 rounds its alpha to 1"""
+FLATNESS = np.log(100.0)
+"""An axis of no thickness is so much thinner, natural logarithm, than the thinnest of its Gaussian that has some"""
+LEAST_LOG_SCALE = -20.0
+"""Of a Gaussian without any size"""
+
+
+def finite(gaussians: Gaussians) -> Gaussians:
+    """Infinite values that mean something, as finite ones: opacity logits of +inf are alpha 1, log scales of -inf flat.
+
+    Opacities of -inf and what is not a number stay.
+    """
+    scales, logits = gaussians.log_scales, gaussians.opacity_logits
+    flat, opaque = np.isneginf(scales), np.isposinf(logits)
+    if flat.any():
+        thinnest = np.where(flat, np.inf, scales).min(axis=1)
+        thin = np.where(np.isposinf(thinnest), LEAST_LOG_SCALE, thinnest - FLATNESS)
+        scales = np.where(flat, thin[:, None], scales).astype(np.float32)
+    if opaque.any():
+        logits = np.where(opaque, OPAQUE_LOGIT, logits).astype(np.float32)
+    return replace(gaussians, log_scales=scales, opacity_logits=logits)
 
 
 def alpha_codes(logits: np.ndarray) -> np.ndarray:

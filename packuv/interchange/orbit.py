@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,9 +48,15 @@ def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
     return float(values[order[np.searchsorted(reached, share * reached[-1])]])
 
 
-def orbit(gaussians: Gaussians, *, options: OrbitOptions) -> tuple[PinholeCamera, ...]:
-    """Cameras `orbit00`, ... that look at the middle of the Gaussians from a circle around it."""
-    centre, radius = middle(gaussians, share=options.share)
+def around(spheres: Sequence[tuple[np.ndarray, float]]) -> tuple[np.ndarray, float]:
+    """Centre and radius of a sphere about others, those of the frames of a sequence."""
+    centres = np.stack([centre for centre, _ in spheres])
+    centre = (centres.min(axis=0) + centres.max(axis=0)) / 2
+    return centre, max(float(np.linalg.norm(c - centre)) + radius for c, radius in spheres)
+
+
+def orbit(centre: np.ndarray, radius: float, *, options: OrbitOptions) -> tuple[PinholeCamera, ...]:
+    """Cameras `orbit00`, ... that look at a sphere from a circle around it."""
     width, height = options.size
     focal = width / 2 / math.tan(math.radians(options.field_deg) / 2)
     distance = 1.1 * radius / math.sin(math.radians(options.field_deg) / 2)

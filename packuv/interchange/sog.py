@@ -87,6 +87,17 @@ def read_sog(path: Path) -> Gaussians:
         raise ValueError(f"{path} is no SOG scene, or damaged: {str(error)[:MESSAGE]}") from None
 
 
+def antialiased(path: Path) -> bool:
+    """Whether a SOG scene that `read_sog` reads says that it was trained with the opacities of Mip-Splatting."""
+    path = Path(path)
+    if path.is_dir() or path.name == META:
+        meta = load_json((path if path.is_dir() else path.parent) / META)
+    else:
+        with zipfile.ZipFile(path) as archive:
+            meta = parse_json(_in_archive(archive, META), META)
+    return meta.get("antialias") is True
+
+
 def _in_folder(folder: Path, name: str) -> bytes:
     if Path(name).name != name:
         raise ValueError(f"{META} names a picture outside its folder: {name!r}")

@@ -21,19 +21,26 @@ import pyarrow as pa
 
 from packuv.bounds import check_count, check_unpacked
 from packuv.files import whole_file
-from packuv.gaussians.floats import Gaussians, drawn
+from packuv.gaussians.floats import Gaussians, drawn, rows_of
 from packuv.interchange.conventions import alpha_codes, drop_largest, logits_of_alpha, restore_largest
 
 MAGIC = b"NGSP"
+GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams (version 4)."""
 V4_HEADER_BYTES, V4_ENTRY = 32, struct.Struct("<QQ")
+ANTIALIASED = 1
+"""Flag: trained with the opacities of Mip-Splatting"""
 HAS_EXTENSIONS = 2
 """Flag; the only extension that changes how values are read is Adobe's range of SH values."""
 COLOUR_SCALE = 0.15
 """SH band 0 is stored as 0.5 + COLOUR_SCALE * value, which leaves room beyond black and white."""
 MOST_FRACTIONAL_BITS = 20
 """Positions are 24-bit fixed point; finer steps than 2^-20 exceed what float32 means in a scene of some metres."""
+STRAY_SHARE = 0.01
+"""Of the Gaussians, at most, that are left out for lying so far away that positions of the others would be coarse:"""
+COARSE = 0.25
+"""in steps above this share of the median Gaussian's smallest extent"""
 SH_STEPS = (8, 16)
 """Step of the SH codes written in band 1, and in the bands above, as the format's own library has it."""
 
@@ -43,13 +50,14 @@ _FLIP_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 """Sign of each coefficient above band 0 under y -> -y, z -> -z: those of odd degree in y z together."""
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> int:
-    """Write an SPZ file of version 3 and return the number of Gaussians in it; what is not drawn is left out.
+def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
+    """Write an SPZ file of version 3 and return the number of Gaussians in it.
 
-    Positions get as many fractional bits as the scene's extent allows. Raises ValueError where even whole units do
-    not reach.
+    What is not drawn is left out. Positions get as many fractional bits as the scene's extent allows; the few farthest
+    are left out where others would be coarse for them. Raises ValueError where even whole units do not reach.
     """
     kept = drawn(gaussians)
+    kept = rows_of(kept, _near_enough(kept))
     bits = _fractional_bits(kept.means)
     points = np.rint(kept.means.astype(np.float64) * _FLIP_POINT * 2**bits).astype("<i4")
     rotation = (kept.quaternions * _FLIP_ROTATION)[:, [1, 2, 3, 0]]  # x y z w
@@ -62,7 +70,8 @@ def write_spz(path: Path, gaussians: Gaussians) -> int:
         _pack_rotation(rotation),
         _pack_bands(kept.sh[:, 1:]),
     ]
-    header = HEADER.pack(MAGIC, 3, len(kept), kept.sh_degree, bits, 0, 0)
+    flags = ANTIALIASED if antialiased else 0
+    header = HEADER.pack(MAGIC, 3, len(kept), kept.sh_degree, bits, flags, 0)
     body = header + b"".join(np.ascontiguousarray(stream).tobytes() for stream in streams)
     with whole_file(path) as partial:
         partial.write_bytes(gzip.compress(body, 6, mtime=0))  # no date: same scene, same bytes
@@ -84,6 +93,16 @@ def read_spz(path: Path) -> Gaussians:
         raise ValueError(f"{path}: {error}") from None
 
 
+def antialiased(path: Path) -> bool:
+    """Whether an SPZ file is marked as trained with the opacities of Mip-Splatting; a file that is none is not."""
+    data = Path(path).read_bytes()
+    try:
+        start = zlib.decompressobj(wbits=31).decompress(data, HEADER.size) if data[:2] == GZIP else data
+        return bool(HEADER.unpack_from(start)[5] & ANTIALIASED)
+    except (zlib.error, struct.error):
+        return False
+
+
 @dataclass(frozen=True)
 class _Header:
     version: int
@@ -100,7 +119,7 @@ class _Header:
 
 def _open(data: bytes) -> tuple[_Header, list[np.ndarray]]:
     """Header, and the streams as bytes."""
-    packed = data[:2] == b"\x1f\x8b"
+    packed = data[:2] == GZIP
     unpacker = zlib.decompressobj(wbits=31)
     start = unpacker.decompress(data, HEADER.size) if packed else data
     magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(start)
@@ -180,10 +199,28 @@ def _points(stream: np.ndarray, header: _Header) -> np.ndarray:
     return (wide.view("<i4").reshape(-1, 3) >> 8) / 2.0**header.fractional_bits
 
 
+def _near_enough(gaussians: Gaussians) -> np.ndarray:
+    """Mask [n] of those that keep their place in fixed point: all, or all but a few strays."""
+    reach = np.abs(gaussians.means).max(axis=1, initial=0)
+    if not len(reach):
+        return np.ones(0, bool)
+    extent = float(np.median(np.exp(np.median(gaussians.log_scales, axis=1))))
+    farthest = np.sort(reach)[-1 - int(STRAY_SHARE * len(reach)) :]  # the last that stays, and whom it may cost
+    all_bits, most_bits = _bits(float(farthest[-1])), _bits(float(farthest[0]))
+    if 2.0**-all_bits <= COARSE * extent or most_bits == all_bits:
+        return np.ones(len(reach), bool)
+    near: np.ndarray = reach <= 2.0 ** (23 - most_bits) - 1
+    return near
+
+
 def _fractional_bits(means: np.ndarray) -> int:
     reach = float(np.abs(means).max(initial=0))
     if not reach < 2**23 - 1:
         raise ValueError(f"SPZ holds positions up to {2**23 - 1} units from the origin, but the scene reaches {reach}")
+    return _bits(reach)
+
+
+def _bits(reach: float) -> int:
     return min(MOST_FRACTIONAL_BITS, 23 - math.ceil(math.log2(max(reach, 1) + 1)))
 
 

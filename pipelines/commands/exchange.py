@@ -27,26 +27,36 @@ def export_frames(arguments: argparse.Namespace) -> int:
     Such files know no light: each frame goes out as it is seen in its own.
     """
     from packuv.files import whole_folder
-    from packuv.gaussians.floats import lit_gaussians
+    from packuv.gaussians.floats import drawn, lit_gaussians
     from packuv.interchange import write_gaussians
+    from packuv.interchange.adopt import ANTIALIASED
     from packuv.scene import open_scene
 
     kind = _splat_format(arguments.format, arguments.output)
     with open_scene(arguments.scene) as scene:
+        smooth = scene.header.extra.get(ANTIALIASED) is True
         if arguments.frame is not None:
             check_frame(len(scene), arguments.frame)
             gaussians = lit_gaussians(scene.gaussians(arguments.frame), scene.light(arguments.frame))
-            count = write_gaussians(arguments.output, gaussians, kind=kind)
-            print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}")
+            count = write_gaussians(arguments.output, gaussians, kind=kind, antialiased=smooth)
+            lost = len(drawn(gaussians)) - count
+            print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}{_far_text(lost)}")
             return 0
         frames = frames_of(len(scene), arguments.frames)
+        lost = 0
         with whole_folder(arguments.output) as folder, shown(arguments, "export") as progress:
             for done, frame in enumerate(frames, start=1):
                 gaussians = lit_gaussians(scene.gaussians(frame), scene.light(frame))
-                write_gaussians(folder / f"{frame:06d}{kind.suffix}", gaussians, kind=kind)
+                path = folder / f"{frame:06d}{kind.suffix}"
+                lost += len(drawn(gaussians)) - write_gaussians(path, gaussians, kind=kind, antialiased=smooth)
                 progress(done, len(frames))
-    print(f"{arguments.output}: {len(frames)} files, frames {frames.start} to {frames.stop - 1}")
+    print(f"{arguments.output}: {len(frames)} files, frames {frames.start} to {frames.stop - 1}{_far_text(lost)}")
     return 0
+
+
+def _far_text(count: int) -> str:
+    """What SPZ's fixed point leaves out."""
+    return f"; {count:,} left out, so far away that positions of the others would be coarse" if count else ""
 
 
 def _splat_format(name: str | None, output: Path) -> SplatFormat:
@@ -106,16 +116,28 @@ def _import_frames(arguments: argparse.Namespace) -> int:
 
 def _import_text(facts: Mapping[str, Any]) -> str:
     segments = f"{facts['segments']} segment{'s' if facts['segments'] > 1 else ''}"
-    dropped = f"{facts['undrawn']:,} of {facts['gaussians']:,} are broken or too faint to be drawn"
+    dropped = f"{facts['broken']:,} of {facts['gaussians']:,} are broken, {facts['faint']:,} too faint to be drawn"
     lines = [
         f"{facts['file']}: {facts['frames']} frames in {segments}, {size_text(facts['bytes'])}",
         f"gaussians  {dropped}; the UV map has no texel for {facts['pruned']:,}",
-        f"kept       {facts['kept_share']:.1%} of what is drawn, {facts['kept_alpha_share']:.1%} of its alpha",
+        f"kept       {_share(facts['kept_share'])} of what is to be drawn, "
+        f"{_share(facts['kept_alpha_share'])} of its alpha",
     ]
+    if facts["empty"]:
+        lines.append(f"empty      {facts['empty']} of {facts['frames']} frames")
+    if facts["antialiased"]:
+        lines.append(
+            "opacities  are those of Mip-Splatting, and drawn as others are: what is thin looks thicker from afar"
+        )
     if facts["psnr_db"]:
         pruned, whole = (_decibels(facts[key]) for key in ("psnr_pruned_db", "psnr_db"))
         lines.append(f"pictures   {whole} against the original; {pruned} by the UV map alone")
     return "\n".join(lines)
+
+
+def _share(value: float) -> str:
+    """All is all: what rounds to it is less."""
+    return f"{value if value == 1 else min(value, 0.999):.1%}"
 
 
 def _decibels(values: list[float | None]) -> str:

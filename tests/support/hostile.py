@@ -40,7 +40,7 @@ from packuv.scene.header import CHECKSUM, HEADER
 from packuv.scene.lookahead import DamageError
 from packuv.scene.matroska import Packet, VideoTrack, write_matroska
 from packuv.viewer.source import SceneSource, describe, tables_bytes
-from tests.support.splats import random_gaussians
+from tests.support.splats import ksplat_bytes, random_gaussians, splat_bytes
 
 SECONDS, EXTRA_BYTES = 2.0, 300 << 20
 """What reading a hostile file may take"""
@@ -221,6 +221,7 @@ def splat_files(folder: Path) -> dict[str, bytes]:
     for suffix, write in ((".ply", write_ply), (".compressed.ply", write_compressed_ply), (".spz", write_spz)):
         write(folder / f"valid{suffix}", gaussians)
         found[suffix] = (folder / f"valid{suffix}").read_bytes()
+    found[".splat"], (found[".ksplat"], _) = splat_bytes(gaussians), ksplat_bytes(gaussians, 2)
     return found
 
 

@@ -98,11 +98,13 @@ def test_a_file_cut_anywhere_is_refused(tmp_path, data):
     ("change", "message"),
     [
         ((b"ply\n", b"plx\n"), "not a PLY file"),
-        ((b"binary_little_endian", b"ascii"), "export it as a binary PLY"),
+        ((b"binary_little_endian", b"binary_middle_endian"), "export it as a binary PLY"),
+        ((b"binary_little_endian", b"ascii"), "no rows of numbers"),
         ((b"float opacity", b"float opacitx"), r"lacks the columns \['opacity'\]"),
         ((b"float f_rest_0", b"float g_rest_0"), "8 columns"),
         ((b"element vertex", b"element point"), "no element vertex"),
-        ((b"property float x", b"property list uchar int x"), "no header line"),
+        ((b"property float x", b"property list uchar int x"), "this one has a list"),
+        ((b"property float x", b"property long x"), "no header line"),
     ],
 )
 def test_what_is_no_ply_of_gaussians_is_refused(tmp_path, change, message):

@@ -101,7 +101,7 @@ def test_a_sequence_goes_out_and_comes_back(scene, tmp_path, capsys):
     assert run("export", scene, "--frames", "1:4", "-o", tmp_path / "more") == WRONG
     assert run("import", tmp_path / "frames", "--fps", "30000/1001", "-o", tmp_path / "b.mkv", "--json") == OK
     facts = json.loads(capsys.readouterr().out)
-    assert (facts["frames"], facts["gaussians"], facts["undrawn"]) == (3, 90 + 90 + 86, 0)
+    assert (facts["frames"], facts["gaussians"], facts["broken"]) == (3, 90 + 90 + 86, 0)
     assert facts["kept_share"] <= 1
     assert len(facts["psnr_db"]) == 18
     with open_scene(tmp_path / "b.mkv") as back, open_scene(scene) as first:
