@@ -75,8 +75,12 @@ TIME_WITHIN, SIZE_WITHIN = 1.25, 1.5
 
 BASE_BYTES = 310_000_000
 """Memory of a job that has loaded its libraries"""
-PIXEL_BYTES = 200
+PIXEL_BYTES = 175
 """Of each fitted pixel of an instant: pictures, masks, and the backdrop's layers before and behind what moves"""
+DECODER_BYTES = 12
+"""Of each pixel of an instant as filmed: an open decoder a camera"""
+WORKING_BYTES = 400
+"""Of each pixel of the picture that is in work"""
 CODE_BYTES = 14
 """Of one Gaussian without view dependence: three 16-bit positions, eight of ten 8-bit columns after removing repeats"""
 COPIES = 1
@@ -285,7 +289,10 @@ def pilot_minutes(size: Size, options: SequenceOptions, machine: Machine, frames
 
 def memory_of(size: Size, options: SequenceOptions, most: int) -> float:
     """Bytes of the largest job; `most`: that it may fill with pictures and layers."""
-    return BASE_BYTES + min(PIXEL_BYTES * 1e6 * _mpx(size.fitted, options), most)
+    held = min(PIXEL_BYTES * 1e6 * _mpx(size.fitted, options), most)
+    filmed = sum(width * height for width, height in size.fitted)
+    largest = max(_mpx([shape], options) for shape in size.fitted)
+    return BASE_BYTES + held + DECODER_BYTES * filmed + WORKING_BYTES * 1e6 * largest
 
 
 def store_bytes(size: Size, options: SequenceOptions) -> float:
