@@ -304,6 +304,10 @@ class TrackEntry:
         return mosaic
 
 
+class HeaderDamageError(ValueError):
+    """A header that is not the one that was written."""
+
+
 @dataclass(frozen=True)
 class SceneIndex:
     """All that packuv.json holds."""
@@ -422,16 +426,19 @@ class SceneIndex:
 
     @classmethod
     def decode(cls, attachments: Mapping[str, bytes]) -> SceneIndex:
-        """The inverse of `encode`; raises ValueError for attachments that are missing, damaged or make no sense."""
+        """The inverse of `encode`.
+
+        Raises HeaderDamageError for attachments that are missing or damaged, ValueError for those that make no sense.
+        """
         for name in (HEADER, CHECKSUM):
             if name not in attachments:
-                raise ValueError(f"it is not a whole PackUV scene, it lacks the attachment {name}")
+                raise HeaderDamageError(f"it is not a whole PackUV scene, it lacks the attachment {name}")
         document = attachments[HEADER]
         if attachments[CHECKSUM][:200].decode(errors="replace").split() != [
             hashlib.sha256(document).hexdigest(),
             HEADER,
         ]:
-            raise ValueError(f"its header {HEADER} is damaged, it does not match {CHECKSUM}")
+            raise HeaderDamageError(f"its header {HEADER} is damaged, it does not match {CHECKSUM}")
         try:
             return cls.from_json(parse_json(document, "it"))
         except ValueError as error:

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.scene.header import TRACK_NAMES, SceneIndex
-from packuv.scene.matroska import Decoder, FoundPacket, Reader
+from packuv.scene.header import TRACK_NAMES
+from packuv.scene.matroska import Decoder, FoundPacket
+from packuv.scene.source import Source
 
 MOST_PIXELS_A_BYTE = 256
 """Of a packet; FFV1's range coder gets a picture of one grey to 98"""
@@ -51,9 +52,8 @@ class DamageError(ValueError):
 class LookAhead:
     """Hands out pictures in the order in which they are asked for, and decodes those that will come next."""
 
-    def __init__(self, path: Path, reader: Reader, index: SceneIndex, *, workers: int) -> None:
-        self._path, self._reader, self._index = path, reader, index
-        self._times_ms = index.header.times_ms
+    def __init__(self, path: Path, source: Source, *, workers: int) -> None:
+        self._path, self._source, self._index = path, source, source.index
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="packuv-decode")
         self._depth = 2 * workers
         self._queue: deque[tuple[Address, Future[np.ndarray]]] = deque()
@@ -90,7 +90,7 @@ class LookAhead:
     def _start(self, address: Address) -> None:
         """Read a packet and begin to decode it; trouble waits until the picture is asked for."""
         try:
-            found = self._reader.read(address.track, int(self._times_ms[address.frame]))
+            found = self._source.read(address.track, address.packet, address.frame)
         except ValueError as error:
             failed: Future[np.ndarray] = Future()
             failed.set_exception(DamageError(f"{error} ({address.name})", address, None))
@@ -117,7 +117,7 @@ class LookAhead:
         """This thread's decoder of a track."""
         decoders: dict[int, Decoder] = self._local.__dict__.setdefault("decoders", {})
         if track not in decoders:
-            decoders[track] = self._reader.decoder(track, self._index.tracks[track].video(track))
+            decoders[track] = self._source.decoder(track)
         return decoders[track]
 
     def _damage(self, what: str, address: Address, found: FoundPacket) -> DamageError:

@@ -72,13 +72,13 @@ class Encoder:
 
 
 class Decoder:
-    """Decodes the pictures of one track, on the calling thread."""
+    """Decodes the pictures of one track, on the calling thread; decoders may work at the same time."""
 
-    def __init__(self, track: VideoTrack, extradata: bytes | None) -> None:
+    def __init__(self, track: VideoTrack, codec_private: bytes) -> None:
         self._track = track
         self._context = av.CodecContext.create("ffv1", "r")
         assert isinstance(self._context, av.VideoCodecContext)
-        self._context.extradata = extradata
+        self._context.extradata = codec_private or None
         self._context.options = {"max_pixels": str(MOST_PIXELS)}
         self._context.width, self._context.height = track.width, track.height
         self._context.thread_count = 1
@@ -206,12 +206,9 @@ class Reader:
             if stream.codec_context is None or stream.codec_context.name != "ffv1":
                 self._container.close()
                 raise ValueError(f"{path}: video track {number} must be FFV1; the file is damaged or no scene")
-        self._extradata = [stream.codec_context.extradata for stream in self._container.streams.video]
+        self.codec_private = tuple(stream.codec_context.extradata or b"" for stream in self._container.streams.video)
+        """Of each track: what its decoder needs"""
         self._packets: Iterator[av.Packet[Any]] = self._container.demux(*self._container.streams.video)
-
-    def decoder(self, number: int, track: VideoTrack) -> Decoder:
-        """A new decoder for a track of the file; decoders may work at the same time, each on one thread."""
-        return Decoder(track, self._extradata[number])
 
     def close(self) -> None:
         self._container.close()
@@ -231,6 +228,13 @@ class Reader:
                     f"its attachment {name!r} has {len(content)} bytes, but {MOST_JSON_BYTES} is the most for a header"
                 )
         return found
+
+    def packets(self) -> Iterator[tuple[int, FoundPacket]]:
+        """Number of the track and packet, all in the order of the file from where the reader is."""
+        numbers = {stream.index: number for number, stream in enumerate(self._container.streams.video)}
+        for packet in self._packets:
+            if packet.size:
+                yield numbers[packet.stream.index], FoundPacket(bytes(packet), packet.pos or 0)
 
     def read(self, track: int, time_ms: int) -> FoundPacket:
         """The packet of a track at a time. Reading in the order of the file costs no seek."""

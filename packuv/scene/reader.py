@@ -13,10 +13,10 @@ from packuv.gaussians.codes import Codes
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
 from packuv.scene.encoder import worker_count
-from packuv.scene.header import COMPRESSION, DYNAMIC, KEY, SceneHeader, SceneIndex
+from packuv.scene.header import COMPRESSION, DYNAMIC, KEY, SceneHeader
 from packuv.scene.lookahead import Address, LookAhead
-from packuv.scene.matroska import Reader
 from packuv.scene.sharing import assemble
+from packuv.scene.source import Source
 from packuv.scene.stream import REPEAT, Playback, key_codes
 
 NO_RESIDUALS = np.empty((0, 0), np.uint8)
@@ -41,14 +41,9 @@ class Scene:
 
     def __init__(self, path: Path, *, threads: int = 0) -> None:
         self.path = path
-        reader = Reader(path)
-        try:
-            self.index = _read_index(path, reader)
-        except BaseException:
-            reader.close()
-            raise
-        self._reader = reader
-        self._pictures = LookAhead(path, reader, self.index, workers=worker_count(threads))
+        self._source = Source(self.path)
+        self.index = self._source.index
+        self._pictures = LookAhead(path, self._source, workers=worker_count(threads))
         self._keys: dict[int, Codes] = {}  # of the segment at hand and those on the way to it, as their keys were
         self._segment = self._frame = -1
         self._playback: Playback | None = None
@@ -62,7 +57,7 @@ class Scene:
 
     def close(self) -> None:
         self._pictures.close()
-        self._reader.close()
+        self._source.close()
 
     @property
     def header(self) -> SceneHeader:
@@ -223,14 +218,3 @@ class Scene:
                     packet += 1
                 step += 1
             step = 0
-
-
-def _read_index(path: Path, reader: Reader) -> SceneIndex:
-    try:
-        index = SceneIndex.decode(reader.attachments)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    expected = tuple(entry.video(number).name for number, entry in enumerate(index.tracks))
-    if reader.tracks[: len(expected)] != expected:
-        raise ValueError(f"{path} must have the video tracks {expected}, but has {reader.tracks}")
-    return index

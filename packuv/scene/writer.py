@@ -11,8 +11,9 @@ from pathlib import Path
 from packuv.gaussians.segment import Segment
 from packuv.partial import partial_path
 from packuv.progress import Progress, no_progress, part_of
+from packuv.scene.copy import append_copy
 from packuv.scene.encoder import EncodeOptions, SceneEncoder, survey
-from packuv.scene.header import SceneHeader
+from packuv.scene.header import HEADER, SceneHeader
 from packuv.scene.matroska import Spool, write_matroska
 from packuv.scene.verify import verify_scene
 
@@ -56,7 +57,9 @@ def write_scene(
                     encoder.add(Segment.load(segment), lambda done: progress(done, steps))
                 index = encoder.finish()
             videos = [entry.video(number) for number, entry in enumerate(index.tracks)]
-            write_matroska(partial, videos, spool, index.encode(), rate=header.rate)
+            attachments = index.encode()
+            write_matroska(partial, videos, spool, attachments, rate=header.rate)
+            append_copy(partial, attachments[HEADER][1])
         check = verify_scene(partial, threads=threads, progress=part_of(progress, steps // 2, steps))
         if not check.ok:
             raise RuntimeError(f"the scene was written but does not read back: {check.problem}")

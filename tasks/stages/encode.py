@@ -33,7 +33,7 @@ SCENE = "scene.mkv"
 class Encode(Stage):
     """Write the scene file from the segments, in order; by default lossless."""
 
-    name, version = "encode", 3
+    name, version = "encode", 4
     take: Take
     """All cameras"""
     held_out: tuple[str, ...]

@@ -49,7 +49,7 @@ def file(tmp_path_factory):
 def test_pictures_come_back_in_any_order(file):
     path, packets = file
     reader, wanted = Reader(path), pictures()
-    decoders = [reader.decoder(number, track) for number, track in enumerate(TRACKS)]
+    decoders = [Decoder(track, private) for track, private in zip(TRACKS, reader.codec_private, strict=True)]
     order = list(wanted)
     for pass_order in (order, order[::-1], [order[k] for k in np.random.default_rng(0).integers(0, len(order), 30)]):
         for track, time in pass_order:
@@ -107,7 +107,7 @@ def test_a_packet_that_is_none_is_refused(file):
     reader, packet = Reader(file[0]), bytearray(file[1][0, 99])
     packet[:8] = bytes(8)
     with pytest.raises(ValueError, match="'large' does not decode"):
-        reader.decoder(0, TRACKS[0]).decode(bytes(packet[:5]))
+        Decoder(TRACKS[0], reader.codec_private[0]).decode(bytes(packet[:5]))
     with pytest.raises(ValueError, match="'large' does not decode"):
         Decoder(TRACKS[0], b"no parameters").decode(file[1][0, 99])
     reader.close()

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import subprocess
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
@@ -31,6 +32,7 @@ from packuv.scene import (
     verify_scene,
     write_scene,
 )
+from packuv.scene.copy import _END, MAGIC, VOID, read_copy
 from packuv.scene.header import codes_digest
 from packuv.scene.lookahead import Address
 from packuv.scene.matroska import Packet, write_matroska
@@ -465,8 +467,9 @@ def complaint(path, frames):
 @given(st.data())
 def test_a_file_cut_anywhere_says_so(scene_file, tmp_path, data):
     content = scene_file[0].read_bytes()
-    # What follows the last packet is FFmpeg's seek index and statistics: 1 kB that nothing is lost with.
-    path = damaged(scene_file, tmp_path, content[: data.draw(st.integers(0, len(content) - 1024))])
+    # What follows the last packet is FFmpeg's seek index and statistics, 1 kB that nothing is lost with, and the copy.
+    most = len(without_copy(content)) - 1024
+    path = damaged(scene_file, tmp_path, content[: data.draw(st.integers(0, most))])
     assert str(path) in complaint(path, scene_file[1])
 
 
@@ -486,14 +489,14 @@ def test_a_damaged_packet_is_named_and_costs_the_rest_of_its_segment(scene_file,
     with open_scene(path) as scene:
         entry = scene.index.segments[0]
         step = next(k for k, prediction in enumerate(entry.predictions, start=1) if prediction and k > 1)
-        found = scene._reader.read(1, int(scene.header.times_ms[step]))
+        found = scene._source.read(1, entry.packet(step), step)
     content = bytearray(path.read_bytes())
-    content[found.position + len(found.data) // 2] ^= 1
+    content[found.span(path)[0] + len(found.data) // 2] ^= 1
     report = verify_scene(damaged(scene_file, tmp_path, bytes(content)))
     assert report.bad == tuple(range(step, 5))
     start, stop = report.span
     assert report.track == "dynamic"
-    assert start <= found.position + len(found.data) // 2 < stop
+    assert (start, stop) == found.span(path)
     assert content[start:stop] != path.read_bytes()[start:stop]
     place = f"packet {entry.packet(step)} of track 'dynamic' (frame {step}, bytes {start} to {stop - 1})"
     assert place in report.problem
@@ -508,7 +511,7 @@ def test_a_damaged_key_costs_those_that_refer_to_it_and_no_others(scene_file, tm
     path, frames = scene_file
     with open_scene(path) as scene:
         entry = scene.index.segments[1]
-        found = scene._reader.read(0, int(scene.header.times_ms[entry.first]))
+        found = scene._source.read(0, 1, entry.first)
     content = bytearray(path.read_bytes())
     content[found.span(path)[0] + 40] ^= 16
     report = verify_scene(damaged(scene_file, tmp_path, bytes(content)))
@@ -551,7 +554,8 @@ def test_a_file_cut_at_any_element_says_so_and_gives_what_is_left(scene_file, tm
     content = path.read_bytes()
     starts = sorted(set(elements(content, 0, len(content))))
     with open_scene(path) as scene:
-        last = scene._reader.read(1, int(scene.header.times_ms[20])).span(path)[0]
+        entry = scene.index.segments[-1]
+        last = scene._source.read(1, entry.packet(entry.frames - 1), 20).span(path)[0]
     places = [start for start in starts if 0 < start < last]
     assert len(places) > 90  # headers, both attachments, clusters, every block and what it is made of
     saved = []
@@ -569,10 +573,54 @@ def test_a_file_cut_at_any_element_says_so_and_gives_what_is_left(scene_file, tm
     assert saved[-1] >= 15
 
 
+def without_copy(content):
+    """A file as programs that know nothing of the copy write it."""
+    return content[: content.rindex(VOID + b"\0")]
+
+
 def test_damage_to_the_header_is_named(scene_file, tmp_path):
     content = scene_file[0].read_bytes().replace(b'"rate":"30000/1001"', b'"rate":"30000/1002"')
     with pytest.raises(ValueError, match=r"header packuv\.json is damaged"):
-        open_scene(damaged(scene_file, tmp_path, content))
+        open_scene(damaged(scene_file, tmp_path, without_copy(content)))
+
+
+def test_no_damaged_byte_outside_of_packets_costs_anything(scene_file, tmp_path):
+    """Of the file's structure, the header, its checksum, and the copy of it."""
+    path, frames = scene_file
+    content = path.read_bytes()
+    copy = read_copy(path)
+    free = np.ones(len(content), bool)
+    with open_scene(path) as scene:
+        for track, places in enumerate(copy.positions):
+            for number, place in enumerate(places):
+                free[place : place + scene.index.tracks[track].sizes[number]] = False
+    rng = np.random.default_rng(0)
+    for place in [0, 3, len(content) - 1, *rng.choice(np.flatnonzero(free), 60)]:
+        changed = bytearray(content)
+        changed[place] ^= 1 << rng.integers(8)
+        with open_scene(damaged(scene_file, tmp_path, bytes(changed)), threads=1) as scene:
+            assert scene.header.times_ns.tolist() == copy_times(copy)
+            for frame in (0, 4, 20):
+                assert same(scene.codes(frame), frames[frame])
+
+
+def copy_times(copy):
+    return json.loads(copy.header)["times_ns"]
+
+
+def test_a_copy_of_another_scene_or_of_moved_packets_tells_nothing(scene_file, tmp_path):
+    """As a program leaves it that changes the file before it."""
+    path = scene_file[0]
+    content = path.read_bytes()
+    at = len(without_copy(content))
+    other = content[at:].replace(b"packuv-copy", b"packuv-copx")
+    moved = content[:at] + VOID + (100).to_bytes(7, "big") + bytes(100) + content[at:]
+    for changed in (content[:at], content[:at] + other, moved):
+        assert verify_scene(damaged(scene_file, tmp_path, changed)).ok
+    packed = zlib.compress(read_copy(path).header.replace(b'"30000/1001"', b'"30000/1002"')), zlib.compress(b"{}")
+    append = b"".join(packed)
+    end = _END.pack(hashlib.sha256(append).digest(), *map(len, packed), MAGIC)
+    assert verify_scene(damaged(scene_file, tmp_path, content[:at] + append + end)).ok
 
 
 def rewritten(scene_file, tmp_path, change):
@@ -624,9 +672,11 @@ ODD_VALUES = [None, True, -1, 0, 1, 3, 10**9, 2**70, 0.5, "", "x", [], {}, [1], 
 def parts(scene_file):
     """Header, packets in the order of the file, and tracks."""
     with open_scene(scene_file[0]) as scene:
-        document, times = json.loads(scene._reader.attachments["packuv.json"]), scene.header.times_ms
-        places = [(address.track, int(times[address.frame])) for address in scene._wanted(0, 0, 20)]
-        packets = [Packet(*place, 33, scene._reader.read(*place).data) for place in places]
+        document, times = json.loads(read_copy(scene_file[0]).header), scene.header.times_ms
+        packets = [
+            Packet(address.track, int(times[address.frame]), 33, scene._source.read(*vars(address).values()).data)
+            for address in scene._wanted(0, 0, 20)
+        ]
         tracks = [entry.video(number) for number, entry in enumerate(scene.index.tracks)]
     return document, packets, tracks
 

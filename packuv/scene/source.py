@@ -1,0 +1,92 @@
+"""Where the header and the packets of a scene file come from: its second copy, or else the file's own structure."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import zlib
+from pathlib import Path
+
+from packuv.scene.copy import Copy, read_copy
+from packuv.scene.header import CHECKSUM, HEADER, HeaderDamageError, SceneIndex
+from packuv.scene.matroska import Decoder, FoundPacket, Reader
+
+
+class Source:
+    """An open scene file; for one thread, but for `decoder`.
+
+    Either of header and copy will do. Raises FileNotFoundError for a missing file, and ValueError for one that is no
+    scene, or whose header is damaged in both places.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._copy = Path(path), read_copy(path)
+        self._reader: Reader | None = None
+        self.index = self._read_index()
+        self._times_ms = self.index.header.times_ms
+
+    def close(self) -> None:
+        if self._reader:
+            self._reader.close()
+
+    def decoder(self, track: int) -> Decoder:
+        """A new decoder for a track."""
+        source = self._copy or self._reader
+        assert source is not None
+        return Decoder(self.index.tracks[track].video(track), source.codec_private[track])
+
+    def read(self, track: int, number: int, frame: int) -> FoundPacket:
+        """A packet by its number in the track; `frame` is the one it belongs to.
+
+        What is found where the copy says is looked for in the file's structure if it is not what was written: programs
+        that write the file anew may move packets. Raises ValueError where nothing is found.
+        """
+        if self._copy:
+            entry = self.index.tracks[track]
+            found = self._copy.read(track, number, entry.sizes[number])
+            lost = self._reader is None or track >= len(self._reader.tracks)  # a structure that is damaged itself
+            if lost or zlib.crc32(found.data) == entry.crc32[number]:
+                return found
+        assert self._reader is not None
+        return self._reader.read(track, int(self._times_ms[frame]))
+
+    def _read_index(self) -> SceneIndex:
+        try:
+            self._reader = Reader(self._path)
+        except ValueError as error:
+            return self._copied_index(error)
+        try:
+            return self._own_index(self._reader)
+        except HeaderDamageError as error:
+            return self._copied_index(error)
+        except ValueError:
+            self.close()
+            raise
+
+    def _own_index(self, reader: Reader) -> SceneIndex:
+        try:
+            attachments = reader.attachments
+            index = SceneIndex.decode(attachments)
+        except ValueError as error:
+            raise type(error)(f"{self._path}: {error}") from None
+        expected = tuple(entry.video(number).name for number, entry in enumerate(index.tracks))
+        if reader.tracks[: len(expected)] != expected:
+            raise HeaderDamageError(f"{self._path} must have the video tracks {expected}, but has {reader.tracks}")
+        if self._copy and (self._copy.header != attachments[HEADER] or not _has_places(self._copy, index)):
+            self._copy = None  # of another scene
+        return index
+
+    def _copied_index(self, error: ValueError) -> SceneIndex:
+        """The header of the copy; raises the error of the file's own where there is none that makes sense."""
+        if self._copy:
+            checksum = f"{hashlib.sha256(self._copy.header).hexdigest()}  {HEADER}".encode()
+            with contextlib.suppress(ValueError):
+                index = SceneIndex.decode({HEADER: self._copy.header, CHECKSUM: checksum})
+                if _has_places(self._copy, index):
+                    return index
+        self.close()
+        raise ValueError(str(error)) from None
+
+
+def _has_places(copy: Copy, index: SceneIndex) -> bool:
+    return [len(places) for places in copy.positions] == [len(track.sizes) for track in index.tracks]
