@@ -25,20 +25,32 @@ from packuv.raster.view import TILE, view_constants
 
 @dataclass(frozen=True)
 class Pairs:
-    """Gaussians as one camera sees them, and their pairs with tiles by slot: grouped by Gaussian."""
+    """Gaussians as one camera sees them, and their pairs with tiles."""
 
     record: Tensor
     """float32 [N, 16], see the CPU's `project`; undefined where nothing is drawn"""
+    keys: Tensor
+    """int64 [P]: the tile's number, and in the lower half the bits of the depth"""
+    gaussians: Tensor
+    """int32 [P]: row of the record"""
+    masks: Tensor
+    """int32 [P]: blocks of the tile that the Gaussian reaches"""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the GPU that they hold."""
+        return sum(tensor.nbytes for tensor in (self.record, self.keys, self.gaussians, self.masks))
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """N Gaussians whose pairs are grouped by Gaussian: a pair's place is its slot."""
+
+    pairs: Pairs
     visible: Tensor
     """int32 [N]: pairs of each Gaussian"""
     first_pair: Tensor
     """int64 [N + 1]: bounds of each Gaussian's slots"""
-    keys: Tensor
-    """int64 [P]: the tile's number, and in the lower half the bits of the depth"""
-    gaussians: Tensor
-    """int32 [P]"""
-    masks: Tensor
-    """int32 [P]: blocks of the tile that the Gaussian reaches"""
     invalid_count: int
     """Gaussians that are skipped"""
 
@@ -47,9 +59,7 @@ class Pairs:
 class _Drawn:
     """The lists that a picture was blended from."""
 
-    record: Tensor
-    gaussians: Tensor
-    masks: Tensor
+    pairs: Pairs
     slots: Tensor
     """int64 [P], by tile and depth"""
     start: Tensor
@@ -67,7 +77,7 @@ class _Kept:
     fields: tuple[Tensor, ...]
     view: Tensor
     sh_degree: int
-    own: Pairs
+    own: _Listed
     drawn: _Drawn
     pictures: tuple[Tensor, Tensor, Tensor]
 
@@ -96,12 +106,14 @@ class GpuLayer(Composed):
     """Gaussians that stay, projected and listed once; every rendering over them blends them anew."""
 
     pairs: Pairs
-    """On the GPU"""
+    """On the GPU, of what shows"""
+    invalid_count: int
+    """Gaussians skipped, as in a rendering"""
 
     @property
     def nbytes(self) -> int:
-        """Memory of the computer that it holds; that of the GPU is none of it."""
-        return self.view.nbytes + self.active.nbytes
+        """Memory that it holds, nearly all of it the GPU's: 64 bytes per Gaussian that shows and 16 per pair."""
+        return self.view.nbytes + self.active.nbytes + self.pairs.nbytes
 
 
 def compose(
@@ -116,7 +128,8 @@ def compose(
     view, active = view_constants(camera, options.near, options.low_pass_px2), checked_tiles(tiles, camera)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     check(gaussians, degree)
-    return GpuLayer(view, active, _listed(_uploaded(gaussians), degree, view, active, camera.height))
+    listed = _listed(_uploaded(gaussians), degree, view, active, camera.height)
+    return GpuLayer(view, active, _shown(listed), listed.invalid_count)
 
 
 def forward(
@@ -137,8 +150,8 @@ def forward(
     active = checked_tiles(tiles, camera) if over is None else over.tiles_to_draw(tiles, weights, camera, options)
     fields = _uploaded(gaussians)
     own = _listed(fields, degree, view, active, camera.height)
-    drawn = _sorted(own, active.size) if over is None else _sorted_over(over, own, active)
-    shares = torch.zeros(len(own.keys) if weights else 1, device=MEMORY)
+    drawn = _sorted(own.pairs if over is None else _joined(over.pairs, own.pairs, active), active.size)
+    shares = torch.zeros(len(own.pairs.keys) if weights else 1, device=MEMORY)
     pictures = _blended(drawn, camera, on_device(np.asarray(background, np.float32)), weights, shares)
     sums = None
     if weights:
@@ -161,7 +174,7 @@ def backward(
     """Arguments and errors as in `cpu.backward`."""
     kept = rendering._kept
     own, fields = kept.own, kept.fields
-    count, pair_count = len(own.visible), len(own.keys)
+    count, pair_count = len(own.visible), len(own.pairs.keys)
     chosen = on_device(np.ones(count, np.uint8) if rows is None else checked_rows(rows, count))
     slopes = [_slope(d, p) for d, p in zip((d_colour, d_depth, d_alpha), kept.pictures, strict=True)]
     partial = torch.empty((pair_count, project.SUMS), device=MEMORY)
@@ -169,13 +182,13 @@ def backward(
     _blend_backward(kept, slopes, chosen, partial, used)
     out = [torch.zeros_like(f) for f in fields] + [torch.zeros((count, 2), device=MEMORY)]
     overflown = torch.zeros(1, dtype=torch.int32, device=MEMORY)
-    given = *fields, kept.sh_degree, kept.view, own.record, chosen, own.first_pair, used, partial
+    given = *fields, kept.sh_degree, kept.view, own.pairs.record, chosen, own.first_pair, used, partial
     run_rows(project.project_backward, count, *given, *out, overflown)
     means, log_scales, quaternions, logits, sh, screen = map(_array, out)
     return Gradients(means, log_scales, quaternions, logits, sh, screen, int(overflown))
 
 
-def _listed(fields: tuple[Tensor, ...], degree: int, view: np.ndarray, active: np.ndarray, height: int) -> Pairs:
+def _listed(fields: tuple[Tensor, ...], degree: int, view: np.ndarray, active: np.ndarray, height: int) -> _Listed:
     """Project, and find the active tiles, uint8 [tiles_y, tiles_x], that each Gaussian reaches."""
     count, areas = len(fields[0]), np.zeros((active.shape[0] + 1, active.shape[1] + 1), np.int32)
     areas[1:, 1:] = active.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
@@ -191,7 +204,14 @@ def _listed(fields: tuple[Tensor, ...], degree: int, view: np.ndarray, active: n
     keys, gaussians, masks = torch.empty(pairs, dtype=torch.int64, device=MEMORY), _integers(pairs), _integers(pairs)
     depth_bits = record[:, DEPTH].contiguous().view(torch.int32)
     run_rows(project.list_tiles, count, record, box, depth_bits, tiles, height, first_pair, keys, gaussians, masks)
-    return Pairs(record, hits, first_pair, keys, gaussians, masks, int(invalid))
+    return _Listed(Pairs(record, keys, gaussians, masks), hits, first_pair, int(invalid))
+
+
+def _shown(listed: _Listed) -> Pairs:
+    """The pairs, and the records that they need."""
+    pairs, shows = listed.pairs, listed.visible > 0
+    rows = torch.cumsum(shows, 0, dtype=torch.int32) - 1
+    return Pairs(pairs.record[shows], pairs.keys, rows[pairs.gaussians], pairs.masks)
 
 
 def _sorted(pairs: Pairs, tile_count: int) -> _Drawn:
@@ -200,23 +220,18 @@ def _sorted(pairs: Pairs, tile_count: int) -> _Drawn:
     bounds = torch.arange(tile_count + 1, device=MEMORY) << 32
     start = torch.searchsorted(keys, bounds)
     shown = torch.nonzero(start[1:] > start[:-1])[:, 0]
-    return _Drawn(pairs.record, pairs.gaussians, pairs.masks, slots, start, shown, torch.zeros_like(start[1:]))
+    return _Drawn(pairs, slots, start, shown, torch.zeros_like(start[1:]))
 
 
-def _sorted_over(layer: GpuLayer, own: Pairs, active: np.ndarray) -> _Drawn:
-    """Lists of a layer's Gaussians, which come first, and of others, in the active tiles."""
-    still = layer.pairs
+def _joined(still: Pairs, own: Pairs, active: np.ndarray) -> Pairs:
+    """Those of a layer, which come first, and others, in the active tiles."""
     keep = on_device(active).reshape(-1)[still.keys >> 32] > 0
-    both = Pairs(
+    return Pairs(
         torch.cat([still.record, own.record]),
-        own.visible,
-        own.first_pair,
         torch.cat([still.keys[keep], own.keys]),
         torch.cat([still.gaussians[keep], own.gaussians + len(still.record)]),
         torch.cat([still.masks[keep], own.masks]),
-        own.invalid_count,
     )
-    return _sorted(both, active.size)
 
 
 def _blended(
@@ -226,22 +241,26 @@ def _blended(
     shape = camera.height, camera.width
     colour = background[:, None, None].expand(3, *shape).contiguous()
     depth, alpha = torch.zeros(shape, device=MEMORY), torch.zeros(shape, device=MEMORY)
-    walked = drawn.record, drawn.gaussians, drawn.masks, drawn.slots, drawn.start, drawn.shown
     out = colour, depth, alpha, drawn.used_end, int(weighed), shares
-    run(blend.blend, len(drawn.shown), *walked, -(-camera.width // TILE), background, *out)
+    run(blend.blend, len(drawn.shown), *_walked(drawn), -(-camera.width // TILE), background, *out)
     return colour, depth, alpha
 
 
 def _blend_backward(kept: _Kept, slopes: Sequence[Tensor], chosen: Tensor, partial: Tensor, used: Tensor) -> None:
     """Partial gradients of a rendering's own Gaussians; a layer's, which come before them, are not chosen."""
-    drawn, own = kept.drawn, kept.own
-    still = len(drawn.record) - len(own.record)
+    drawn, own = kept.drawn, kept.own.pairs
+    still = len(drawn.pairs.record) - len(own.record)
     rows = torch.cat([torch.zeros(still, dtype=torch.uint8, device=MEMORY), chosen])
-    walked = drawn.record, drawn.gaussians, drawn.masks, drawn.slots, drawn.start, drawn.shown, drawn.used_end
     columns = -(-kept.pictures[1].shape[1] // TILE)
     first_slot = len(drawn.slots) - len(own.keys)
-    given = *walked, columns, *kept.pictures, *slopes, rows, first_slot
+    given = *_walked(drawn), drawn.used_end, columns, *kept.pictures, *slopes, rows, first_slot
     run(blend.blend_backward, len(drawn.shown), *given, partial, used)
+
+
+def _walked(drawn: _Drawn) -> tuple[Tensor, ...]:
+    """What kernels walk the lists by."""
+    pairs = drawn.pairs
+    return pairs.record, pairs.gaussians, pairs.masks, drawn.slots, drawn.start, drawn.shown
 
 
 def _slope(gradient: np.ndarray | None, picture: Tensor) -> Tensor:

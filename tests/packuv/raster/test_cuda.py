@@ -44,6 +44,7 @@ def both(gaussians, view, *, slopes=None, rows=None, near=OPTIONS.near, still=No
         if still is not None:
             layer_near, tiles = beneath or (near, None)
             over = compose(still, view, options=dataclasses.replace(options, near=layer_near), tiles=tiles)
+            assert over.invalid_count == 0
         drawn = render(gaussians, view, options=options, background=BACKGROUND, over=over, **given)
         found.append((drawn, gradients(drawn, *(slopes or upstream(view)), rows=rows)))
     return found
@@ -176,6 +177,16 @@ def test_over_a_layer():
     given = {"still": still, "near": 4.0, "beneath": (3.5, mine), "rows": rows}
     for tiles in (None, np.array([[True, False], [True, False]])):
         assert_agree(both(moving, view, tiles=tiles, **given))
+
+
+def test_a_layer_holds_what_shows_and_says_how_much():
+    gaussians, view = scene(30), camera(16, 16)
+    gaussians.means[::2] = view.centre - view.forward
+    layer = compose(gaussians, view, options=RasterOptions(OPTIONS.near, device="cuda"))
+    drawn = render(gaussians, view, options=OPTIONS)
+    shown = int((drawn.visible > 0).sum())
+    assert 0 < shown <= 15
+    assert layer.nbytes == 64 * shown + 16 * drawn.pair_count + layer.view.nbytes + layer.active.nbytes
 
 
 def test_at_equal_depth_the_layer_comes_first():
