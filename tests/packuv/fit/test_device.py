@@ -1,5 +1,5 @@
-"""Who renders and labels. What the CUDA kernels make is tried in `tests/packuv/raster/test_cuda.py`, whose tests need a
-GPU or numba's simulator: here they run in the latter.
+"""Who renders, compares and labels. What the CUDA kernels make is tried in the files `test_cuda.py`, here and under
+`raster`, whose tests need a GPU or numba's simulator: here they run in the latter.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from tests.support.places import ROOT
 def test_the_cuda_kernels_do_what_the_cpus_do_in_the_simulator():
     """In an interpreter of its own, since numba reads the switch when it is imported."""
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": str(ROOT)}
-    tests = ["tests/packuv/raster/test_cuda.py", "-p", "no:cacheprovider"]
-    command = [sys.executable, "-m", "pytest", *tests]
+    tests = ["tests/packuv/raster/test_cuda.py", "tests/packuv/fit/test_cuda.py"]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *tests]
     environment.pop("PACKUV_REQUIRE", None)
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -13,12 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from packuv.fit.device import drawn_differently, labelled_differently
-from packuv.fit.model import Model
-from packuv.fit.options import FitOptions
-from packuv.fit.shots import Shot
-from packuv.fit.solver import Solver
-from packuv.fit.start.bounds import Bounds
 from packuv.gaussians.floats import Gaussians
 from packuv.raster import RasterOptions, compose, gradients, render, tile_shape
 from tests.support.dense_raster import BACKGROUND, FIELDS, OPTIONS, camera, reference, scene, upstream
@@ -216,22 +210,3 @@ def test_wrong_input_is_refused_with_what_came():
         gradients(rendering, *upstream(view), rows=np.ones(4, bool))
     with pytest.raises(ValueError, match="must have its shape"):
         gradients(rendering, np.zeros((3, 5, 5), np.float32))
-
-
-def test_labels_are_the_cpus():
-    assert labelled_differently("cuda") is None
-
-
-@needs("cuda", torch.cuda.is_available(), "no CUDA device, and the simulator would take minutes")
-def test_the_made_up_scene_and_a_fit_are_the_cpus():
-    assert drawn_differently("cuda") is None
-    views = [camera(), camera(64, 48)]
-    targets = [render(scene(60, degree=0, seed=4), view, options=OPTIONS).colour.clip(0, 1) for view in views]
-    shots = [Shot(view, target) for view, target in zip(views, targets, strict=True)]
-    losses = []
-    for device in ("cpu", "cuda"):
-        options = FitOptions(device=device)
-        solver = Solver(Model(scene(60, degree=0)), Bounds(np.zeros(3), 2.0, 0.05), options, np.random.default_rng(0))
-        losses.append([solver.run(shots, 4, of=12)["photometric"] for _ in range(3)])
-    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
-    assert losses[1][-1] < 0.9 * losses[1][0]

@@ -37,6 +37,7 @@ launch.MEMORY, launch.run = torch.device("cpu"), compiled
 launch.run_rows = lambda kernel, count, *given: compiled(kernel, count, *given)
 
 from packuv.fit.labels import LabelOptions, count_hits
+from packuv.fit.losses import PhotometricOptions, photometric_loss
 from packuv.raster.cuda import render
 from tests.support.dense_raster import camera, scene, upstream
 
@@ -44,9 +45,10 @@ rendering = render.forward(scene(5), camera(), options=RasterOptions(0.05, devic
 render.backward(rendering, *upstream(camera()))
 masks = [np.ones((50, 70), bool)]
 count_hits(scene(5), [camera()], masks, near=0.05, options=LabelOptions(), device="cuda")
+photometric_loss(*np.zeros((2, 3, 9, 9), np.float32), options=PhotometricOptions(), device="cuda")
 """
 DOUBLE = {"project", "project_backward", "vote_all"}
-SINGLE = {"count_tiles", "list_tiles", "blend", "sum_shares", "blend_backward"}
+SINGLE = {"count_tiles", "list_tiles", "blend", "sum_shares", "blend_backward", "_compare", "_slopes"}
 
 
 def compiler() -> bool:
