@@ -106,6 +106,22 @@ def test_opaque_walls_end_the_blending_where_the_cpus_do():
     assert_agree(both(gaussians, view))
 
 
+def test_a_block_of_pixels_ends_by_itself():
+    """Two walls end the left column of blocks; what comes 32 Gaussians later is so bright that 1e-4 of it shows."""
+    gaussians, view = scene(40, degree=0), camera(16, 16)
+    depth = np.linspace(1, 1.5, 40)[:, None]
+    gaussians.means[:] = view.centre + view.forward * depth
+    gaussians.log_scales[:], gaussians.opacity_logits[:], gaussians.quaternions[:] = 5.0, -4.5, (1, 0, 0, 0)
+    gaussians.means[:2] -= 9.3 / 14.4 * depth[:2] * view.camera_from_world[0, :3]
+    gaussians.log_scales[:2], gaussians.opacity_logits[:2] = (1.0, 4.0, -3.0), 80.0
+    gaussians.sh[33:] = 4e6
+    found = both(gaussians, view)
+    assert_agree(found)
+    for drawn, _ in found:
+        assert drawn.colour[:, :, :4].max() < 1
+        assert drawn.colour[:, :, 4:].min() > 5
+
+
 def degenerate() -> Gaussians:
     """Needles, discs, points and giants, behind, on and just before the camera's plane, saturated, far away, broken."""
     gaussians, view = scene(24, seed=4), camera(17, 17)
