@@ -2,7 +2,7 @@
 
     python -m bench.raster --out runs/raster.json                          # a made-up room
     python -m bench.raster --ply scene.ply --out runs/raster.json          # a trained scene
-    python -m bench.raster --device cuda --out runs/raster.json            # and the same iteration on a GPU
+    python -m bench.raster --device cuda --out runs/raster.json            # and that iteration on a GPU, by gsplat too
 
 Times are the least and the median of several repetitions, milliseconds. With one thread they are CPU time, which other
 processes disturb least; with more they are wall time. Compare rows of one run.
@@ -10,6 +10,7 @@ processes disturb least; with more they are wall time. Compare rows of one run.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import platform
@@ -30,6 +31,7 @@ import numpy as np
 from numba import njit
 
 from bench import command
+from packuv import raster
 from packuv.camera import PinholeCamera
 from packuv.fit.adam import AdamState, adam_step
 from packuv.fit.device import choose_device
@@ -192,9 +194,10 @@ class Iteration:
         options: BenchOptions,
         clock: Clock,
         device: str = "cpu",
+        renderer: Any = raster,
     ) -> None:
         rng = np.random.default_rng(options.seed)
-        self.gaussians, self.camera, self.clock = gaussians, camera, clock
+        self.gaussians, self.camera, self.clock, self.renderer = gaussians, camera, clock, renderer
         self.target = rng.random((3, camera.height, camera.width)).astype(np.float32)
         self.work, self.raster = Arena(), RasterOptions(near=0.05, device=device)
         self.parameters = [getattr(gaussians, f.name).copy() for f in fields(Gaussians)]
@@ -207,7 +210,7 @@ class Iteration:
         drawn: Rendering = timed(
             clock,
             times["forward"],
-            render,
+            self.renderer.render,
             self.gaussians,
             self.camera,
             options=self.raster,
@@ -217,7 +220,7 @@ class Iteration:
         loss = timed(
             clock, times["loss"], photometric_loss, drawn.colour, target, options=PhotometricOptions(), tiles=tiles
         )
-        found = timed(clock, times["backward"], gradients, drawn, loss.gradient, rows=rows)
+        found = timed(clock, times["backward"], self.renderer.gradients, drawn, loss.gradient, rows=rows)
         visible = drawn.visible > 0
         timed(clock, times["adam"], self._step, found, visible if rows is None else visible & rows)
         return drawn
@@ -273,6 +276,30 @@ def measure_device(gaussians: Gaussians, camera: PinholeCamera, options: BenchOp
     for samples in (*iteration.times.values(), labels):
         del samples[0]  # compiles
     return {"device": device, "iteration": iteration.summary(), "labels": summary(labels), "views": options.views}
+
+
+def measure_devices(
+    gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions, devices: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Each device's, and gsplat's where both a GPU and gsplat are there."""
+    measured = [measure_device(gaussians, camera, options, name) for name in devices]
+    if "cuda" in devices and importlib.util.find_spec("gsplat"):
+        measured.append(measure_yardstick(gaussians, camera, options))
+    return measured
+
+
+def measure_yardstick(
+    gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions, device: str = "cuda"
+) -> dict[str, Any]:
+    """The iteration with gsplat in place of the CUDA rasterizer."""
+    from bench import yardstick
+
+    iteration = Iteration(gaussians, camera, options, time.perf_counter, device, yardstick)
+    for _ in range(options.repeats + 1):
+        iteration.run()
+    for samples in iteration.times.values():
+        del samples[0]  # compiles
+    return {"device": f"{device} by gsplat", "iteration": iteration.summary()}
 
 
 def measure_shares(gaussians: Gaussians, camera: PinholeCamera, options: BenchOptions) -> list[dict[str, Any]]:
@@ -439,7 +466,7 @@ def run(options: BenchOptions, ply: Path | None = None, device: str = "cpu") -> 
         "layer": [measure_layer(options, n) for n in sorted({1, compiler.config.NUMBA_NUM_THREADS})],
         "active_tiles": measure_shares(gaussians, camera, options),
         "compiler": measure_compiler(),
-        "devices": [measure_device(gaussians, camera, options, name) for name in devices],
+        "devices": measure_devices(gaussians, camera, options, devices),
     }
 
 
@@ -468,7 +495,8 @@ def report(result: dict[str, Any]) -> Iterator[str]:
         for name, value in row["stages"].items():
             yield f"    {name:20} {value['min_ms']:8.2f} {value['median_ms']:8.2f}"
     for row in result["devices"]:
-        columns = {**row["iteration"], f"labels in {row['views']} views": row["labels"]}
+        labels = {f"labels in {row['views']} views": row["labels"]} if "labels" in row else {}
+        columns = {**row["iteration"], **labels}
         yield f"{row['device']}, wall: " + ", ".join(f"{name} {v['median_ms']:.2f}" for name, v in columns.items())
     yield f"first calls: cold {result['compiler']['cold']}, warm {result['compiler']['warm']}"
 

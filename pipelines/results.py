@@ -202,7 +202,17 @@ def remains(run: Run) -> Remains:
 
 REPORT = "report"
 """What writing it is called among the stages of a run; a report does not tell of itself"""
-PACKAGES = ("torch", "torchcodec", "numpy", "numba", "av", "opencv-python-headless", "pycolmap", "prefect", "gsplat")
+PACKAGES = (
+    "torch",
+    "torchcodec",
+    "numpy",
+    "numba",
+    "av",
+    "opencv-python-headless",
+    "pycolmap",
+    "prefect",
+    "numba-cuda",
+)
 """Whose versions may change results, or how long they take"""
 
 

@@ -275,7 +275,7 @@ def _box_is_clear(x, y, xx, yy, sigmas, limit, table):
 
 @kernel(inner=True)
 def _is_hidden(x, y, z, depth, slack):
-    row, column = int(np.floor(y)), int(np.floor(x))  # a float first: on CUDA so is math.floor
+    row, column = np.int64(math.floor(y)), np.int64(math.floor(x))  # on CUDA floor is a float
     if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
         return False
     return depth[row, column] > 0 and z > depth[row, column] * slack
@@ -294,7 +294,7 @@ def _is_hit(x, y, xx, xy, yy, rule, table):
 @kernel(inner=True)
 def _pixel(x, y, table):
     """Whether the pixel under a point in the picture is in the mask."""
-    row, column = int(np.floor(y)), int(np.floor(x))  # a float first: on CUDA so is math.floor
+    row, column = np.int64(math.floor(y)), np.int64(math.floor(x))  # on CUDA floor is a float
     return table[row + 1, column + 1] - table[row, column + 1] - table[row + 1, column] + table[row, column] > 0
 
 

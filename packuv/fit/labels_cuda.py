@@ -9,8 +9,9 @@ from typing import Any
 import numba.cuda
 import numpy as np
 
+from packuv.raster.cuda.launch import on_device, run_rows, shared
+
 cuda: Any = numba.cuda
-_BLOCK = 32, 8
 
 
 def count_on_gpu(
@@ -25,14 +26,13 @@ def count_on_gpu(
 
     `opinion` judges one Gaussian in one view; a voter is a view, its table and depths.
     """
-    hits, seen = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
-    if not len(means) or not voters:
-        return hits, seen
-    views, tables, depths = (list(part) for part in zip(*voters, strict=True))
-    grid = -(-len(means) // _BLOCK[0]), -(-len(voters) // _BLOCK[1])
-    pictures = _stacked(tables), _sizes(tables), _stacked(depths), _sizes(depths)
-    _kernel(opinion)[grid, _BLOCK](means, shapes, visible, np.stack(views), *pictures, rule, hits, seen)
-    return hits, seen
+    hits, seen = (on_device(np.zeros(len(means), np.int32)) for _ in range(2))
+    if voters:
+        views, tables, depths = (list(part) for part in zip(*voters, strict=True))
+        pictures = _stacked(tables), _sizes(tables), _stacked(depths), _sizes(depths)
+        given = map(on_device, (means, shapes, visible, np.stack(views), *pictures, rule))
+        run_rows(_kernel(opinion), len(means) * len(voters), *given, hits, seen)
+    return hits.cpu().numpy(), seen.cpu().numpy()
 
 
 def _stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
@@ -51,15 +51,16 @@ def _sizes(pictures: Sequence[np.ndarray]) -> np.ndarray:
 @cache
 def _kernel(opinion: Callable[..., tuple[bool, bool]]) -> Any:
     """A thread for each Gaussian and view."""
+    judge = shared(opinion)
 
     @cuda.jit
     def vote_all(means, shapes, visible, views, tables, table_sizes, depths, depth_sizes, rule, hits, seen):
-        i, c = cuda.grid(2)
-        if i >= means.shape[0] or c >= views.shape[0] or not visible[i]:
+        i, c = cuda.grid(1) % means.shape[0], cuda.grid(1) // means.shape[0]
+        if c >= views.shape[0] or not visible[i]:
             return
         table = tables[c, : table_sizes[c, 0], : table_sizes[c, 1]]
         depth = depths[c, : depth_sizes[c, 0], : depth_sizes[c, 1]]
-        saw, hit = opinion(means, shapes, views[c], table, depth, rule, i)
+        saw, hit = judge(means, shapes, views[c], table, depth, rule, i)
         if saw:
             cuda.atomic.add(seen, i, 1)
         if hit:

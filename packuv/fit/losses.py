@@ -16,14 +16,14 @@ from packuv.kernels.simd import ALL, WIDTH, above, fma, larger, load, select, sp
 from packuv.raster.view import TILE
 
 RADIUS = 5
-_WINDOW = 2 * RADIUS + 1
+_LENGTH = 2 * RADIUS + 1
 _STRIP = 6
 """Rows of tiles per piece of work. A piece computes 20 more rows than it owns, so short strips waste work; long ones
 leave threads idle and, with few active tiles, cover pixels that nobody asked for."""
 _f32 = np.float32
-_weights = np.exp(-((np.arange(_WINDOW) - RADIUS) ** 2) / (2 * 1.5**2))
-_KERNEL = (_weights / _weights.sum()).astype(np.float32)
-_C1, _C2 = _f32(0.01**2), _f32(0.03**2)
+_weights = np.exp(-((np.arange(_LENGTH) - RADIUS) ** 2) / (2 * 1.5**2))
+WINDOW = (_weights / _weights.sum()).astype(np.float32)
+C1, C2 = _f32(0.01**2), _f32(0.03**2)
 _0, _1, _2 = _f32(0), _f32(1), _f32(2)
 
 
@@ -56,12 +56,13 @@ def photometric_loss(
     options: PhotometricOptions,
     tiles: np.ndarray | None = None,  # bool [tiles_y, tiles_x]
     out: np.ndarray | None = None,  # float32 [3, H, W]
+    device: str = "cpu",
 ) -> PhotometricLoss:
     """L1 and SSIM of a picture, and the gradient of their mix.
 
     `tiles` limits the loss to active tiles of 16 x 16 pixels: the means run over their pixels only, pixels elsewhere
     count as equal to the target where a window reaches them, and the gradient there is zero. `out` takes the gradient.
-    Raises ValueError if shapes do not fit.
+    `device`, cpu or cuda, tells who compares. Raises ValueError if shapes do not fit.
     """
     channels, height, width = _checked(picture, target)
     shape = (-(-height // TILE), -(-width // TILE))
@@ -70,18 +71,37 @@ def photometric_loss(
         raise ValueError(
             f"tiles must be bool {shape} for pictures {picture.shape}, but is {active.dtype} {active.shape}"
         )
-    prefer_tbb()
-    pieces = _pieces(active, width, height)
-    sums = np.empty((channels * len(pieces), 2))
     gradient = np.empty_like(target) if out is None else out
     pixels = _pixel_count(active, height, width)
     scale = 1.0 / max(channels * pixels, 1)
+    scales = (1 - options.ssim_share) * scale, -options.ssim_share * scale
     if tiles is not None:
         gradient[:] = 0
-    _l1_ssim(picture.reshape(-1), target.reshape(-1), active.view(np.uint8), pieces,
-             (1 - options.ssim_share) * scale, -options.ssim_share * scale, gradient.reshape(-1), sums)  # fmt: skip
-    l1, ssim = sums.sum(0) * scale if pixels else (0.0, 1.0)
+    compare = _compare_on_cpu if device == "cpu" else _compare_on_gpu
+    l1, ssim = compare(picture, target, active, *scales, gradient) * scale if pixels else (0.0, 1.0)
     return PhotometricLoss((1 - options.ssim_share) * l1 + options.ssim_share * (1 - ssim), l1, ssim, gradient)
+
+
+def _compare_on_cpu(
+    picture: np.ndarray, target: np.ndarray, active: np.ndarray, l1_scale: float, ssim_scale: float, out: np.ndarray
+) -> np.ndarray:  # float64 [2]
+    """Sums of absolute differences and of SSIM over active pixels; `out` takes the gradient of both, scaled."""
+    prefer_tbb()
+    pieces = _pieces(active, picture.shape[2], picture.shape[1])
+    sums = np.empty((len(picture) * len(pieces), 2))
+    _l1_ssim(picture.reshape(-1), target.reshape(-1), active.view(np.uint8), pieces, l1_scale, ssim_scale,
+             out.reshape(-1), sums)  # fmt: skip
+    return np.asarray(sums.sum(0))
+
+
+def _compare_on_gpu(
+    picture: np.ndarray, target: np.ndarray, active: np.ndarray, l1_scale: float, ssim_scale: float, out: np.ndarray
+) -> np.ndarray:  # float64 [2]
+    """The same by CUDA; imported late, for it needs torch."""
+    from packuv.fit.losses_cuda import compare_on_gpu
+
+    absolute, similarity, out[:] = compare_on_gpu(picture, target, active, l1_scale, ssim_scale)
+    return np.array([absolute, similarity])
 
 
 def _checked(picture: np.ndarray, target: np.ndarray) -> tuple[int, int, int]:
@@ -120,8 +140,8 @@ def _pieces(active: np.ndarray, width: int, height: int) -> np.ndarray:
 @kernel(inner=True)
 def _blur_row(memory, source, out, stride):
     """memory[out + x] = sum of window[k] * memory[source + x + k]; the source has ten values more."""
-    w0, w1, w2 = splat(_KERNEL[0]), splat(_KERNEL[1]), splat(_KERNEL[2])
-    w3, w4, w5 = splat(_KERNEL[3]), splat(_KERNEL[4]), splat(_KERNEL[5])
+    w0, w1, w2 = splat(WINDOW[0]), splat(WINDOW[1]), splat(WINDOW[2])
+    w3, w4, w5 = splat(WINDOW[3]), splat(WINDOW[4]), splat(WINDOW[5])
     for x in range(source, source + stride, WIDTH):
         total = w5 * load(memory, x + 5)
         total = fma(w4, load(memory, x + 4) + load(memory, x + 6), total)
@@ -134,14 +154,14 @@ def _blur_row(memory, source, out, stride):
 @kernel(inner=True)
 def _blur_column(memory, ring, y, out, stride):
     """Sum of window[k] times row y - 5 + k of a ring of 11 rows."""
-    w0, w1, w2 = splat(_KERNEL[0]), splat(_KERNEL[1]), splat(_KERNEL[2])
-    w3, w4, w5 = splat(_KERNEL[3]), splat(_KERNEL[4]), splat(_KERNEL[5])
-    a0, b0 = ring + (y - 5) % _WINDOW * stride, ring + (y + 5) % _WINDOW * stride
-    a1, b1 = ring + (y - 4) % _WINDOW * stride, ring + (y + 4) % _WINDOW * stride
-    a2, b2 = ring + (y - 3) % _WINDOW * stride, ring + (y + 3) % _WINDOW * stride
-    a3, b3 = ring + (y - 2) % _WINDOW * stride, ring + (y + 2) % _WINDOW * stride
-    a4, b4 = ring + (y - 1) % _WINDOW * stride, ring + (y + 1) % _WINDOW * stride
-    c = ring + y % _WINDOW * stride
+    w0, w1, w2 = splat(WINDOW[0]), splat(WINDOW[1]), splat(WINDOW[2])
+    w3, w4, w5 = splat(WINDOW[3]), splat(WINDOW[4]), splat(WINDOW[5])
+    a0, b0 = ring + (y - 5) % _LENGTH * stride, ring + (y + 5) % _LENGTH * stride
+    a1, b1 = ring + (y - 4) % _LENGTH * stride, ring + (y + 4) % _LENGTH * stride
+    a2, b2 = ring + (y - 3) % _LENGTH * stride, ring + (y + 3) % _LENGTH * stride
+    a3, b3 = ring + (y - 2) % _LENGTH * stride, ring + (y + 2) % _LENGTH * stride
+    a4, b4 = ring + (y - 1) % _LENGTH * stride, ring + (y + 1) % _LENGTH * stride
+    c = ring + y % _LENGTH * stride
     for x in range(0, stride, WIDTH):
         total = w5 * load(memory, c + x)
         total = fma(w4, load(memory, a4 + x) + load(memory, b4 + x), total)
@@ -185,7 +205,7 @@ def _ssim_row(memory, blurred, mask, owned, derivatives, step, stride):
     `blurred` begins four rows of `stride`: a, b, a a + b b, a b; `derivatives` three rows of `step`. Returns the sum
     where the row `owned` is 1.
     """
-    one, two, c1, c2, zero, total = splat(_1), splat(_2), splat(_C1), splat(_C2), zeros(ALL), zeros(ALL)
+    one, two, c1, c2, zero, total = splat(_1), splat(_2), splat(C1), splat(C2), zeros(ALL), zeros(ALL)
     for x in range(0, stride, WIDTH):
         a, b = load(memory, blurred + x), load(memory, blurred + stride + x)
         squares, product = load(memory, blurred + 2 * stride + x), load(memory, blurred + 3 * stride + x)
@@ -233,8 +253,8 @@ def _piece(picture, target, active, width, height, y0, y1, x0, x1, l1_scale, ssi
     """
     count = x1 - x0
     stride = (count + 2 * RADIUS + WIDTH - 1) // WIDTH * WIDTH
-    step, ring = stride + 2 * WIDTH, _WINDOW * stride
-    derivatives = 5 * _WINDOW * step
+    step, ring = stride + 2 * WIDTH, _LENGTH * stride
+    derivatives = 5 * _LENGTH * step
     owned = derivatives + 3 * step
     rings = owned + step
     blurred = rings + 7 * ring
@@ -242,7 +262,7 @@ def _piece(picture, target, active, width, height, y0, y1, x0, x1, l1_scale, ssi
     memory[owned + RADIUS : owned + RADIUS + count] = _1
     absolute, similarity = np.float64(0), np.float64(0)
     for row in range(y0 - 2 * RADIUS, y1 + 2 * RADIUS):
-        read = row % _WINDOW * 5 * step
+        read = row % _LENGTH * 5 * step
         if 0 <= row < height:
             begin, end = max(x0 - 2 * RADIUS, 0), min(x1 + 2 * RADIUS, width)
             _read_row(picture, target, active[row // TILE], row * width, begin, end, memory,
@@ -250,22 +270,22 @@ def _piece(picture, target, active, width, height, y0, y1, x0, x1, l1_scale, ssi
         else:
             memory[read : read + 5 * step] = _0
         for k in range(4):
-            _blur_row(memory, read + k * step, rings + k * ring + row % _WINDOW * stride, stride)
+            _blur_row(memory, read + k * step, rings + k * ring + row % _LENGTH * stride, stride)
         y = row - RADIUS
         if y < y0 - RADIUS:
             continue
         for k in range(4):
             _blur_column(memory, rings + k * ring, y, blurred + k * stride, stride)
-        mask = (y % _WINDOW * 5 + 4) * step + RADIUS
+        mask = (y % _LENGTH * 5 + 4) * step + RADIUS
         total = _ssim_row(memory, blurred, mask, owned, derivatives, step, stride)
         similarity += total if y0 <= y < y1 else _0
         for k in range(3):
-            _blur_row(memory, derivatives + k * step, rings + (4 + k) * ring + y % _WINDOW * stride, stride)
+            _blur_row(memory, derivatives + k * step, rings + (4 + k) * ring + y % _LENGTH * stride, stride)
         y = row - 2 * RADIUS
         if y >= y0:
             for k in range(3):
                 _blur_column(memory, rings + (4 + k) * ring, y, blurred + k * stride, stride)
-            read = y % _WINDOW * 5 * step + 2 * RADIUS
+            read = y % _LENGTH * 5 * step + 2 * RADIUS
             absolute += _gradient_row(memory, read, step, blurred, owned + RADIUS, stride, l1_scale, ssim_scale)
             for x in range(count):
                 gradient[y * width + x0 + x] = memory[blurred + x]

@@ -53,7 +53,7 @@ class SolverOptions(LossOptions):
     shows must then be covered, and no camera can be explained by leaving a place half transparent"""
     seed: int = 0
     device: str = "cpu"
-    """Who renders and labels: "cpu", or "cuda" (see `packuv.fit.device`); the rest is done by the CPU either way"""
+    """Who renders, compares and labels: "cpu", or "cuda" (see `packuv.fit.device`); the CPU does the rest either way"""
     density: DensityOptions = field(default_factory=DensityOptions)
     rates: Rates = field(default_factory=Rates)
     uv: UvOptions = field(default_factory=UvOptions)

@@ -257,7 +257,16 @@ class Solver:
         colour = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
         picture = shot.response.shown(colour)
         found = pulls(
-            Seen(rendering, picture, shot.wanted(picture), shot, self.model.gaussians, moving, self.bounds.radius),
+            Seen(
+                rendering,
+                picture,
+                shot.wanted(picture),
+                shot,
+                self.model.gaussians,
+                moving,
+                self.bounds.radius,
+                options.device,
+            ),
             options,
         )
         drawn = self._carried_back(rendering, found, shot.response, behind)

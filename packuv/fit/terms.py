@@ -34,6 +34,8 @@ class Seen:
     """bool [N], which may change and are seen"""
     radius: float
     """Of the scene"""
+    device: str = "cpu"
+    """Who compares: cpu or cuda"""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,9 @@ Term = Callable[[Seen, LossOptions], Pull | None]
 
 def photometric(seen: Seen, options: LossOptions) -> Pull | None:
     """L1 and SSIM."""
-    loss = photometric_loss(seen.picture, seen.target, options=options.photometric, tiles=seen.shot.tiles)
+    loss = photometric_loss(
+        seen.picture, seen.target, options=options.photometric, tiles=seen.shot.tiles, device=seen.device
+    )
     return Pull(loss.value, colour=loss.gradient)
 
 

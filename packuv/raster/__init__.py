@@ -2,7 +2,7 @@
 
 `render` draws Gaussians with one camera, `gradients` carries derivatives of the picture back to them. `compose` makes
 Gaussians that stay a layer, over which a few others are drawn again and again at little cost. The options' device
-decides who does the work, our kernels or gsplat; arrays are numpy's either way.
+decides who does the work, which must be cpu or cuda; arrays are numpy's either way.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def render(
     arena: Arena | None = None,
     over: Any = None,
 ) -> Any:
-    """Picture of N Gaussians: `cpu.Rendering`, or `gsplat.GpuRendering` with the same fields.
+    """Picture of N Gaussians: `cpu.Rendering`, or `cuda.render.GpuRendering` with the same fields.
 
     `tiles`, bool as `tile_shape(camera)`, names the tiles to draw; the rest shows background. `weights` asks for
     the blending weight of each Gaussian. `arena` holds memory between calls, CPU only. `over` is a layer: the picture
@@ -65,7 +65,7 @@ def render(
             arena=arena,
             over=over,
         )
-    return _gsplat().forward(
+    return _cuda().forward(
         gaussians,
         camera,
         options=options,
@@ -85,11 +85,11 @@ def compose(
     sh_degree: int | None = None,
     tiles: np.ndarray | None = None,
 ) -> Any:
-    """Layer of N Gaussians for one camera and these tiles: `Layer`, or `gsplat.GpuLayer`, which saves no time.
+    """Layer of N Gaussians for one camera and these tiles: `Layer`, or `cuda.render.GpuLayer`.
 
     The near plane of `options` stays that of these Gaussians, whatever is drawn over them.
     """
-    backend = layer if options.device == "cpu" else _gsplat()
+    backend = layer if options.device == "cpu" else _cuda()
     return backend.compose(gaussians, camera, options=options, sh_degree=sh_degree, tiles=tiles)
 
 
@@ -108,12 +108,12 @@ def gradients(
     """
     if isinstance(rendering, Rendering):
         return cpu.backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
-    found: Gradients = _gsplat().backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
+    found: Gradients = _cuda().backward(rendering, d_colour, d_depth, d_alpha, rows=rows)
     return found
 
 
-def _gsplat() -> Any:
-    """The CUDA backend, imported late: it needs torch, which takes seconds to load."""
-    from packuv.raster import gsplat
+def _cuda() -> Any:
+    """The CUDA rasterizer, imported late: it needs torch, which takes seconds to load."""
+    from packuv.raster.cuda import render
 
-    return gsplat
+    return render

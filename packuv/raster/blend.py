@@ -47,11 +47,11 @@ from packuv.raster.project import BLUE, DEPTH, EXPONENT_UNIT, GREEN, LOG_OPACITY
 from packuv.raster.view import TILE
 
 _f32 = np.float32
-_TRANSMITTANCE_MIN = _f32(1e-4)
-_EXPONENT_MIN = _f32(math.log2(ALPHA_MIN) / EXPONENT_UNIT)
-_EXPONENT_MAX = _f32((math.log2(0.99) + 1.2e-6) / EXPONENT_UNIT)
+TRANSMITTANCE_MIN = _f32(1e-4)
+EXPONENT_MIN = _f32(math.log2(ALPHA_MIN) / EXPONENT_UNIT)
+EXPONENT_MAX = _f32((math.log2(0.99) + 1.2e-6) / EXPONENT_UNIT)
 """Of alpha 0.99, or by rounding a few millionths more: two such layers must take the transmittance below 1e-4."""
-_CHECK_EVERY = 32
+CHECK_EVERY = 32
 _AHEAD = 8
 """List entries between asking for a cache line and using it."""
 
@@ -87,7 +87,7 @@ def still_alive(state, alive):
     while remaining != 0:
         block = lowest_bit(remaining)
         remaining &= remaining - 1
-        if bits(above(load(state, block * WIDTH), splat(_TRANSMITTANCE_MIN))) == 0:
+        if bits(above(load(state, block * WIDTH), splat(TRANSMITTANCE_MIN))) == 0:
             alive &= ~(np.int64(1) << block)
     return alive
 
@@ -118,11 +118,11 @@ def blend_tile(sums, record, pairs, begin, end, tile_x, tile_y, state, weights, 
     Long because LLVM must see the loop over blocks with everything that stays fixed in it.
     """
     align_stack()
-    zero, exponent_min, exponent_max = zeros(ALL), splat(_EXPONENT_MIN), splat(_EXPONENT_MAX)
+    zero, exponent_min, exponent_max = zeros(ALL), splat(EXPONENT_MIN), splat(EXPONENT_MAX)
     origin_x, origin_y = _f32(TILE * tile_x), _f32(TILE * tile_y)
     visited, i = 0, begin
     while i < end and alive != 0:
-        stop = min(i + _CHECK_EVERY, end)
+        stop = min(i + CHECK_EVERY, end)
         while i < stop:
             blocks, slot = np.int64(pairs[i, MASK]) & alive, np.int64(pairs[i, SLOT])
             r = np.int64(pairs[i, GAUSSIAN]) * RECORD
@@ -264,11 +264,11 @@ def gradient_tile(sums, record, pairs, begin, end, tile_x, tile_y, rows, state, 
     reason that `blend_tile` is.
     """
     align_stack()
-    one, zero, exponent_min, exponent_max = splat(_f32(1)), zeros(ALL), splat(_EXPONENT_MIN), splat(_EXPONENT_MAX)
+    one, zero, exponent_min, exponent_max = splat(_f32(1)), zeros(ALL), splat(EXPONENT_MIN), splat(EXPONENT_MAX)
     origin_x, origin_y = _f32(TILE * tile_x), _f32(TILE * tile_y)
     i = begin
     while i < end and alive != 0:
-        stop = min(i + _CHECK_EVERY, end)
+        stop = min(i + CHECK_EVERY, end)
         while i < stop:
             blocks, slot = np.int64(pairs[i, MASK]) & alive, np.int64(pairs[i, SLOT])
             r, chosen = np.int64(pairs[i, GAUSSIAN]) * RECORD, rows[pairs[i, GAUSSIAN]] != 0

@@ -21,7 +21,7 @@ from packuv.raster import blend, merge
 from packuv.raster.arena import Arena
 from packuv.raster.layer import Layer, jobs
 from packuv.raster.lists import Lists, listed
-from packuv.raster.picture import Gradients, RasterOptions, checked_tiles, tile_shape
+from packuv.raster.picture import Gradients, RasterOptions, checked_rows, checked_slope, checked_tiles, tile_shape
 from packuv.raster.project import CHUNKS, RECORD, project_backward
 from packuv.raster.view import TILE, view_constants
 
@@ -139,7 +139,7 @@ def backward(
     """
     kept = rendering._kept
     gaussians, lists, arena, count = kept.gaussians, kept.lists, kept.arena, len(kept.gaussians)
-    chosen = np.ones(count, np.uint8) if rows is None else _checked_rows(rows, count)
+    chosen = np.ones(count, np.uint8) if rows is None else checked_rows(rows, count)
     pictures = [rendering.colour, rendering.depth, rendering.alpha]
     upstream = [_flat(d, p) for d, p in zip((d_colour, d_depth, d_alpha), pictures, strict=True)]
     height, width = rendering.alpha.shape
@@ -159,18 +159,10 @@ def backward(
     return Gradients(out[0], out[1], out[2], out[3], out[4], out[5], int(overflown.sum()))
 
 
-def _checked_rows(rows: np.ndarray, count: int) -> np.ndarray:
-    if rows.shape != (count,) or rows.dtype != bool:
-        raise ValueError(f"rows must be bool ({count},), but is {rows.dtype} {rows.shape}")
-    return np.ascontiguousarray(rows).view(np.uint8)
-
-
 def _flat(gradient: np.ndarray | None, picture: np.ndarray) -> np.ndarray:
     if gradient is None:
         return _no_gradient(picture.size)
-    if gradient.shape != picture.shape:
-        raise ValueError(f"the gradient of a picture {picture.shape} must have its shape, but has {gradient.shape}")
-    return np.ascontiguousarray(gradient, np.float32).reshape(-1)
+    return checked_slope(gradient, picture.shape).reshape(-1)
 
 
 @lru_cache(maxsize=8)

@@ -51,12 +51,13 @@ def listed(
 
     Raises ValueError for arrays that do not fit.
     """
-    _check(gaussians, degree)
+    check(gaussians, degree)
     record, box, cells, invalid = _project(gaussians, degree, view, active, arena, room)
     return Lists(record, *_bin(record, box, cells, active, height, arena), invalid)
 
 
-def _check(gaussians: Gaussians, degree: int) -> None:
+def check(gaussians: Gaussians, degree: int) -> None:
+    """Raise ValueError for arrays that do not fit, or a degree that cannot be rendered."""
     count = len(gaussians)
     shapes = {
         "means": (count, 3),

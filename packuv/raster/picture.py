@@ -20,7 +20,7 @@ class RasterOptions:
     low_pass_px2: float = 0.3
     """Added to both variances of every ellipse in the picture, pixels squared, as in 3D Gaussian Splatting."""
     device: str = "cpu"
-    """cpu, or the name of a torch device that gsplat draws on"""
+    """Who draws: cpu or cuda"""
 
     def __post_init__(self) -> None:
         if not (self.near > 0 and self.low_pass_px2 > 0):
@@ -97,3 +97,17 @@ def checked_tiles(tiles: np.ndarray | None, camera: PinholeCamera) -> np.ndarray
             f"but is {tiles.dtype} {tiles.shape}"
         )
     return np.ascontiguousarray(tiles).view(np.uint8)
+
+
+def checked_rows(rows: np.ndarray, count: int) -> np.ndarray:
+    """The rows that may change, uint8 [count]; raises ValueError if bool `rows` does not fit."""
+    if rows.shape != (count,) or rows.dtype != bool:
+        raise ValueError(f"rows must be bool ({count},), but is {rows.dtype} {rows.shape}")
+    return np.ascontiguousarray(rows).view(np.uint8)
+
+
+def checked_slope(gradient: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The derivatives by a picture of `shape`, float32; raises ValueError if they have another."""
+    if gradient.shape != shape:
+        raise ValueError(f"the gradient of a picture {shape} must have its shape, but has {gradient.shape}")
+    return np.ascontiguousarray(gradient, np.float32)

@@ -16,7 +16,7 @@ from packuv.gaussians.floats import ALPHA_MIN, DRAWN_LOGIT
 from packuv.kernels.compile import kernel
 from packuv.kernels.simd import ALL, load, store, zeros
 from packuv.raster import ewa
-from packuv.raster import sh as harmonics
+from packuv.raster.sh import basis, direction_gradient
 from packuv.raster.view import (
     MAX_COLOUR,
     MAX_LENGTH,
@@ -59,7 +59,7 @@ _in_camera, _linear_map, _rotation, _screen_axes, _covariance = (
 
 
 @kernel(inline=True, fastmath=_FAST)
-def _is_valid(means, log_scales, quaternions, logits, i):
+def is_valid(means, log_scales, quaternions, logits, i):
     length = max(abs(means[i, 0]), max(abs(means[i, 1]), abs(means[i, 2])))
     size = max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2]))
     # One sum finds every value that is not finite; in double precision finite float32 values cannot overflow it.
@@ -79,7 +79,8 @@ def _touches(view, x, y, half_x, half_y, active_sum, box, i):
     y0, y1 = max(y - half_y - 0.5, 0.0), min(y + half_y - 0.5, view[VIEW_HEIGHT] - 1)
     if not (x0 <= x1 and y0 <= y1):
         return False
-    left, top, right, bottom = math.ceil(x0), math.ceil(y0), int(x1), int(y1)
+    left, top = np.int64(math.ceil(x0)), np.int64(math.ceil(y0))  # on CUDA ceil is a float
+    right, bottom = int(x1), int(y1)
     if left > right or top > bottom:
         return False
     c0, r0, c1, r1 = left >> 4, top >> 4, right >> 4, bottom >> 4
@@ -97,10 +98,10 @@ def _direction(view, means, i):
 
 
 @kernel(inline=True, fastmath=_FAST)
-def _colour(view, means, sh, degree, values, record, i):
+def colour(view, means, sh, degree, values, record, i):
     """Write max(0, 0.5 + SH); False if it is not a usable number. `values` is scratch, float32 [16]."""
     x, y, z, _ = _direction(view, means, i)
-    harmonics.basis(degree, x, y, z, values)
+    basis(degree, x, y, z, values)
     r = g = b = _f32(0.5)
     for k in range((degree + 1) * (degree + 1)):
         r += values[k] * sh[i, k, 0]
@@ -111,7 +112,7 @@ def _colour(view, means, sh, degree, values, record, i):
 
 
 @kernel(inline=True, fastmath=_FAST)
-def _project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
+def project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
     """Fill the record (but for the colour) and the box of one valid Gaussian; False if it is not drawn."""
     x, y, z = _in_camera(view, means[i, 0], means[i, 1], means[i, 2])
     if not (z >= view[VIEW_NEAR] and logits[i] >= DRAWN_LOGIT):
@@ -169,10 +170,10 @@ def project(means, log_scales, quaternions, logits, sh, degree, view, active_sum
         bad = 0
         for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
             cells[i] = 0
-            if not _is_valid(means, log_scales, quaternions, logits, i):
+            if not is_valid(means, log_scales, quaternions, logits, i):
                 bad += 1
-            elif _project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
-                if _colour(view, means, sh, degree, values, record, i):
+            elif project_one(means, log_scales, quaternions, logits, view, active_sum, record, box, i):
+                if colour(view, means, sh, degree, values, record, i):
                     cells[i] = (box[i, 2] - box[i, 0] + 1) * (box[i, 3] - box[i, 1] + 1)
                 else:
                     bad += 1
@@ -196,10 +197,10 @@ def _sum_pairs(partial, used, begin, end, out):
 
 
 @kernel(inline=True, fastmath=_FAST)
-def _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i):
+def colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i):
     """Write the gradient of the coefficients; return that of the position through the viewing direction."""
     x, y, z, inverse = _direction(view, means, i)
-    harmonics.basis(degree, x, y, z, values)
+    basis(degree, x, y, z, values)
     r = g[6] if record[i, RED] > 0 else _f32(0)
     gr = g[7] if record[i, GREEN] > 0 else _f32(0)
     b = g[8] if record[i, BLUE] > 0 else _f32(0)
@@ -208,7 +209,7 @@ def _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh,
         d_values[k] = r * sh[i, k, 0] + gr * sh[i, k, 1] + b * sh[i, k, 2]
     for k in range((degree + 1) * (degree + 1), sh.shape[1]):
         d_sh[i, k, 0], d_sh[i, k, 1], d_sh[i, k, 2] = _f32(0), _f32(0), _f32(0)
-    gx, gy, gz = harmonics.direction_gradient(degree, x, y, z, d_values)
+    gx, gy, gz = direction_gradient(degree, x, y, z, d_values)
     along = gx * x + gy * y + gz * z
     return (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse
 
@@ -279,7 +280,7 @@ def _point_gradient(view, u, v, inverse_z, d_depth, screen, jacobian, d_jacobian
 
 
 @kernel(inline=True, fastmath=_FAST)
-def _project_one_backward(
+def project_one_backward(
     means, log_scales, quaternions, logits, view, g, d_log_scales, d_quaternions, d_logits, d_screen, i
 ):
     """Write every gradient of one Gaussian but those through its colour; return that of its position."""
@@ -308,7 +309,7 @@ def _project_one_backward(
 
 
 @kernel(inline=True, fastmath=_FAST)
-def _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
+def clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
     d_means[i, :] = _f32(0)
     d_log_scales[i, :] = _f32(0)
     d_quaternions[i, :] = _f32(0)
@@ -318,7 +319,7 @@ def _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
 
 
 @kernel(inline=True, fastmath=_FAST)
-def _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
+def is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
     total = np.float64(d_logits[i]) + d_screen[i, 0] + d_screen[i, 1]
     for k in range(3):
         total += np.float64(d_means[i, k]) + d_log_scales[i, k] + d_quaternions[i, k] + d_sh[i, 0, k]
@@ -339,14 +340,14 @@ def project_backward(means, log_scales, quaternions, logits, sh, degree, view, r
         bad = 0
         for i in range(count * chunk // CHUNKS, count * (chunk + 1) // CHUNKS):
             if rows[i] == 0 or not _sum_pairs(partial, used, first_pair[i], first_pair[i + 1], g):
-                _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i)
+                clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i)
                 continue
-            x, y, z = _project_one_backward(
+            x, y, z = project_one_backward(
                 means, log_scales, quaternions, logits, view, g, d_log_scales, d_quaternions, d_logits, d_screen, i
             )
-            cx, cy, cz = _colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i)
+            cx, cy, cz = colour_gradient(view, means, sh, degree, record, g, values, d_values, d_sh, i)
             d_means[i, 0], d_means[i, 1], d_means[i, 2] = x + cx, y + cy, z + cz
-            if not _is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
-                _clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i)
+            if not is_finite(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i):
+                clear(d_means, d_log_scales, d_quaternions, d_logits, d_sh, d_screen, i)
                 bad += 1
         overflown[chunk] = bad

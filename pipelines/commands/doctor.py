@@ -63,7 +63,7 @@ def _fit_on_gpu() -> tuple[bool, str]:
     except ImportError as error:
         return False, str(error)
     problem = obstacle()
-    return problem is None, problem or "gsplat draws what the CPU draws"
+    return problem is None, problem or "the GPU draws what the CPU draws"
 
 
 def _gpu() -> tuple[bool, str]:

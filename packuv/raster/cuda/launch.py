@@ -1,0 +1,65 @@
+"""Where arrays of the CUDA rasterizer lie, how its kernels are run, and what they share with the CPU's.
+
+Arrays are torch tensors. In numba's simulator (NUMBA_ENABLE_CUDASIM=1), which runs kernels as Python, they lie in the
+CPU's memory, and everything else is the same.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from types import FunctionType
+from typing import Any
+
+import numba
+import numba.cuda
+import numpy as np
+import torch
+from torch import Tensor
+
+cuda: Any = numba.cuda
+config: Any = numba.config
+SIMULATED = bool(config.ENABLE_CUDASIM)
+MEMORY = torch.device("cpu" if SIMULATED else "cuda")
+THREADS = 256
+"""Of a block, in loops over Gaussians"""
+
+
+def run(kernel: Any, blocks: int, *given: Any) -> None:
+    """Run `blocks` times THREADS threads of a kernel over tensors and numbers; where there are none, nothing."""
+    _allow_small_grids()
+    if blocks > 0:
+        kernel[blocks, THREADS](*map(_as_kernels_see, given))
+
+
+def run_rows(kernel: Any, count: int, *given: Any) -> None:
+    """Run a thread for each of `count` rows."""
+    run(kernel, -(-count // THREADS), *given)
+
+
+def on_device(array: np.ndarray) -> Tensor:
+    """A copy for kernels."""
+    return torch.tensor(array, device=MEMORY)
+
+
+@cache
+def _allow_small_grids() -> None:
+    """Numba warns of what leaves a GPU idle, as pictures of a few tiles do."""
+    config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
+
+
+def _as_kernels_see(value: Any) -> Any:
+    if not isinstance(value, Tensor):
+        return value
+    return value.numpy() if SIMULATED else cuda.as_cuda_array(value)
+
+
+def shared(function: Any) -> Any:
+    """A scalar function of the CPU's kernels, and those that it calls, for kernels of the GPU.
+
+    Numba would take the function by itself, but its `fastmath` as all or nothing: tests for infinity would be gone.
+    """
+    plain = getattr(function, "py_func", function)
+    names = {name: plain.__globals__.get(name) for name in plain.__code__.co_names}
+    called = {name: shared(value) for name, value in names.items() if hasattr(value, "py_func")}
+    again = FunctionType(plain.__code__, plain.__globals__ | called, plain.__name__)
+    return cuda.jit(device=True)(again)
