@@ -362,14 +362,16 @@ def load_durations(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
 
 def with_offsets(capture: Capture, timecodes: Mapping[str, Timecodes], clock: ClockMode) -> dict[str, Timecodes]:
     """Timecodes with what `offsets_of` adds to them; what capture.toml says is said by camera."""
-    said, read = capture.settings.time_offset_s, _read_offsets(capture, clock)
-    moved = dict(timecodes)
-    for camera, codes in timecodes.items():
-        if own := said.get(camera):
-            moved[camera] = codes.moved(int(own * NANOSECONDS))
-        if own := read.get(camera):
-            moved[camera] = moved[camera].moved(int(own * NANOSECONDS), told=False)
-    return moved
+    said, added = capture.settings.time_offset_s, offsets_of(capture, clock)
+    return {
+        camera: codes.moved(int(added.get(camera, 0) * NANOSECONDS)).noting(*_moved_notes(said.get(camera)))
+        for camera, codes in timecodes.items()
+    }
+
+
+def _moved_notes(said: Decimal | None) -> Iterator[str]:
+    if said:
+        yield f"{float(said):+.6g} s are added to its times, as time_offset_s in capture.toml says"
 
 
 def offsets_of(capture: Capture, clock: ClockMode) -> dict[str, Decimal]:
