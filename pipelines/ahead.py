@@ -6,7 +6,7 @@ away, so that what a run refuses is refused here; then comes the look at the mac
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -134,7 +134,9 @@ class _Passing(Journal):
 class _Unread(Originals):
     """A capture whose files are not read for their digests: nothing that is made of it is kept."""
 
-    def digests(self, files: Mapping[str, Path], progress: Progress = no_progress) -> dict[str, str]:
+    def digests(
+        self, files: Mapping[str, Path], progress: Callable[[float, float, str], None] = lambda *_: None
+    ) -> dict[str, str]:
         return dict.fromkeys(files, "unread")
 
     def look(self) -> dict[str, Signature]:
