@@ -16,7 +16,7 @@ from pipelines.options import compose
 from sync.align import AlignOptions, SyncReport
 from sync.capture import CaptureSettings, find_capture
 from sync.clock import ClockMode
-from sync.content import Content, ContentOptions, find_offsets
+from sync.content import Content, ContentOptions, Offset, Window, find_offsets
 from sync.content.sound import RATE
 from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key
@@ -153,6 +153,16 @@ def test_what_the_pictures_say_of_times_is_told(tmp_path: Path) -> None:
     (told,) = [found.text for found in findings(report) if "pictures" in found.text]
     assert told.startswith("The pictures of cam0 lie -1.0 frames")
     assert "time_offset_s = { cam0 = -0.03" in told
+
+
+def test_cameras_that_lie_equally_are_told_to_be_a_group() -> None:
+    offsets = {name: Offset(0.0, 0.1) for name in NAMES} | {name: Offset(3.0, 0.1) for name in NAMES[:2]}
+    content = Content(NAMES, (Window(0, 79, offsets),))
+    texts = [found.text for found in findings(ReportInput("balls", content=content))]
+    (told,) = [text for text in texts if "about the same" in text]
+    assert told.startswith("cam0, cam1 lie by about the same +3 frames, 2 of 5 cameras: pictures tell that two groups")
+    apart = Content(NAMES, (Window(0, 79, offsets | {"cam1": Offset(-2.0, 0.1)}),))
+    assert "about the same" not in " ".join(found.text for found in findings(ReportInput("balls", content=apart)))
 
 
 def test_cameras_without_times_are_synchronized_by_their_pictures(tmp_path: Path) -> None:
