@@ -18,6 +18,8 @@ RATE = 48_000
 """Samples a second that are read"""
 LOOK_S, BLOCK_S = 10.0, 60.0
 """Of a track, in which there must be labels for it to be read to its end; and what is read at once then"""
+LOOKS, SILENT = 12, 1e-6
+"""Times so long that are looked at while all is silent, which is below the least step of 16 bits"""
 FEWEST_LABELS, MOST = 10, 0.5
 """For it to be labels; and the share of them that must go on with the sound, or most are misread"""
 LONG_S = 16.5 / RATE
@@ -112,7 +114,7 @@ def _look(path: Path) -> tuple[list[_Place], list[str]]:
     """Channels that begin with labels, and those that begin with what could be labels."""
     places, unread = list[_Place](), list[str]()
     for track in sound_tracks(path):
-        for start, samples in islice(track.blocks(LOOK_S, RATE), 1):
+        for start, samples in _first_sound(track):
             for channel, wave in enumerate(samples):
                 if labels := decode_ltc(wave, start):
                     hours, minutes, seconds, frames = labels.fields[0]
@@ -123,9 +125,17 @@ def _look(path: Path) -> tuple[list[_Place], list[str]]:
     return places, unread
 
 
+def _first_sound(track: Track) -> Iterator[tuple[float, np.ndarray]]:
+    """The first block of a track that is not silent: a timecode box may be switched on after the camera."""
+    for start, samples in islice(track.blocks(LOOK_S, RATE), LOOKS):
+        if np.ptp(samples, axis=1).max(initial=0.0) > SILENT:
+            yield start, samples
+            return
+
+
 def label_channels(track: Track) -> set[int]:
     """Channels of a track that begin with labels, or with what could be labels."""
-    for _, samples in islice(track.blocks(LOOK_S, RATE), 1):
+    for _, samples in _first_sound(track):
         return {channel for channel, wave in enumerate(samples) if len(_words(wave)[0]) >= FEWEST_LABELS}
     return set()
 

@@ -164,9 +164,9 @@ def _alike(content: Content) -> Iterator[Finding]:
             names = ", ".join(name for name, own in frames.items() if own == number)
             yield Finding(
                 "sync",
-                f"{names} lie by about the same {number:+d} frames, {count} of {len(content.cameras)} cameras: pictures "
-                "tell that two groups differ, and the larger one is taken to be right; if half of the cameras or more "
-                "are wrong alike, it is the others that are named.",
+                f"{names} lie by about the same {number:+d} frames, {count} of {len(content.cameras)} cameras: "
+                "pictures tell that two groups differ, and the larger one is taken to be right; if half of the "
+                "cameras or more are wrong alike, it is the others that are named.",
                 Severity.NOTE,
                 "See whether the cameras of either group have something in common, such as a recorder or a label set "
                 "by hand, before moving their times.",

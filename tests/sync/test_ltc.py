@@ -221,6 +221,14 @@ def test_labels_on_the_second_track_and_numbers_that_are_none(tmp_path: Path) ->
 
 
 @needs_ffmpeg
+def test_labels_that_begin_after_silence_are_heard(tmp_path: Path) -> None:
+    rate = Fraction(25)
+    late = np.concatenate([np.zeros(12 * RATE), wave(labels_from(90_300, 80, rate), rate)])
+    info = probe_video(tracks(tmp_path / "cam.mov", [late]))
+    assert (info.start_label, info.notes) == ("01:00:00:00", ())
+
+
+@needs_ffmpeg
 def test_two_tracks_that_disagree_are_both_told(tmp_path: Path) -> None:
     rate = Fraction(25)
     sounds = [wave(labels_from(first, 80, rate), rate)[: 3 * RATE] for first in (90_000, 90_250)]
