@@ -280,10 +280,14 @@ def check_masks(capture: Capture, videos: Mapping[str, Mapping[str, Any]]) -> No
 
 
 def probe_capture(
-    capture: Capture, tell: Callable[[int, int, str], None] = lambda *_: None, *, listen: bool = True
+    capture: Capture,
+    tell: Callable[[int, int, str], None] = lambda *_: None,
+    *,
+    listen: bool = True,
+    kept: Path | None = None,
 ) -> dict[str, VideoInfo]:
     """What the video of each camera holds; `tell` hears how many are read, of how many, and which is next. `listen` for
-    LTC, which takes the reading of whole sound tracks where there is some.
+    LTC, which takes the reading of whole sound tracks where there is some, once where it is `kept`, see `hear_ltc`.
 
     Pictures, which hold no times, run at the `fps` of capture.toml, or at the rate of most videos, or at 30. Their
     numbers count from the lowest that any camera begins with, as videos count from their first frame.
@@ -298,7 +302,7 @@ def probe_capture(
         tell(len(infos), len(capture.videos), camera)
         videos = [info.rate for name, info in infos.items() if name not in folders]
         rate = capture.settings.fps or (Counter(videos).most_common(1)[0][0] if videos else None)
-        infos[camera] = probe_video(capture.videos[camera], rate=rate, origin=origin, listen=listen)
+        infos[camera] = probe_video(capture.videos[camera], rate=rate, origin=origin, listen=listen, kept=kept)
     return {camera: infos[camera] for camera in capture.cameras}
 
 

@@ -3,17 +3,24 @@ in its middle, too."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import islice
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
 from sync.audio import Track, sound_tracks
 from sync.timecode import NANOSECONDS, frame_to_label, labels_to_ns
+from sync.tree import whole_file
 
+KEPT = 1
+"""Version of the files of what was heard"""
 RATE = 48_000
 """Samples a second that are read"""
 LOOK_S, BLOCK_S = 10.0, 60.0
@@ -71,13 +78,50 @@ class _Labels:
     drop: bool
 
 
-def hear_ltc(path: Path, pts_ns: np.ndarray) -> tuple[Ltc | None, tuple[str, ...]]:
-    """Times of the frames of a video by the LTC on one of its sound channels, None where there is none; and what of it
-    a person should know.
+Heard = tuple[Ltc | None, tuple[str, ...]]
+"""What is heard, None where there is nothing, and what of it a person should know"""
+
+
+def hear_ltc(path: Path, pts_ns: np.ndarray, kept: Path | None = None) -> Heard:
+    """Times of the frames of a video by the LTC on one of its sound channels.
 
     Args:
         pts_ns: int64 [frames], presentation times in the container.
+        kept: folder for what was heard, so that no track with LTC is read twice; None keeps nothing.
     """
+    place = None if kept is None else kept / f"{_mark(path)}.npz"
+    known = None if place is None else _known(place, len(pts_ns))
+    if known is not None:
+        return known
+    heard, notes = _hear(path, pts_ns)
+    if place is not None and heard is not None:
+        _keep(place, heard, notes)
+    return heard, notes
+
+
+def _mark(path: Path) -> str:
+    """Of a file as it is now."""
+    seen = path.stat()
+    words = (KEPT, path.resolve(), seen.st_size, seen.st_mtime_ns, seen.st_ctime_ns, seen.st_ino)
+    return hashlib.sha256("\0".join(map(str, words)).encode()).hexdigest()
+
+
+def _known(place: Path, frames: int) -> Heard | None:
+    with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), np.load(place, allow_pickle=False) as data:
+        said, times = json.loads(str(data["said"])), data["times_ns"]
+        if times.shape == (frames,) and times.dtype == np.int64:
+            return Ltc(times, said["label"], Fraction(said["rate"]), said["jumps"]), tuple(said["notes"])
+    return None  # not there, or damaged
+
+
+def _keep(place: Path, heard: Ltc, notes: Sequence[str]) -> None:
+    said = {"label": heard.label, "rate": str(heard.rate), "jumps": heard.jumps, "notes": list(notes)}
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(place) as file:
+        np.savez(file, times_ns=heard.times_ns, said=np.array(json.dumps(said)))
+
+
+def _hear(path: Path, pts_ns: np.ndarray) -> Heard:
     places, unread = _look(path)
     if not places:
         return None, tuple(f"{place} carries LTC, but is too distorted to be read; it is not used" for place in unread)

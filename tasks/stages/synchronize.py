@@ -29,6 +29,8 @@ from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 
+HEARD = ".heard"
+"""Folder in the store for the LTC of long sound tracks"""
 STARTS = "starts.json"
 STARTS_NS = "starts_ns"
 """Key of the same in the header of a scene"""
@@ -58,7 +60,7 @@ class Synchronize(Stage):
     def build(self, work: Work) -> Notes:
         found = find_capture(work.site.capture)
         self._check(found)
-        infos = probe_capture(found, work.progress, listen=self.starts is None)
+        infos = probe_capture(found, work.progress, listen=self.starts is None, kept=work.site.store / HEARD)
         if self.starts is None:
             timecodes = load_timecodes(found, infos, self.options.clock)
         else:

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sync import ltc
 from sync.capture import find_capture, load_timecodes, probe_capture
 from sync.clock import ClockMode
 from sync.ltc import DROP_RATE, RATE, RATES, _Labels, _of_frames, decode_ltc
@@ -303,3 +304,23 @@ def test_cameras_without_labels_beside_some_with_are_named(tmp_path: Path) -> No
     assert load_timecodes(capture, midnight)["c"].notes == (
         "it has no start label, as a, b have: its times count from 0",
     )
+
+
+@needs_ffmpeg
+def test_what_was_heard_is_kept_until_the_file_is_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rate, kept = Fraction(25), tmp_path / "kept"
+    path = tracks(tmp_path / "cam.mov", [wave(labels_from(90_000, 80, rate), rate)[: 3 * RATE]])
+    first = probe_video(path, kept=kept)
+    (place,) = kept.iterdir()
+    with monkeypatch.context() as deaf:
+        deaf.setattr(ltc, "_hear", lambda *_: pytest.fail("it was heard already"))
+        again = probe_video(path, kept=kept)
+    assert (again.start_label, again.label_rate, again.notes) == (first.start_label, first.label_rate, first.notes)
+    assert np.array_equal(again.heard_ns, first.heard_ns)
+    for damage in (b"", b"PK damaged", place.read_bytes()[:100]):
+        place.write_bytes(damage)
+        assert np.array_equal(probe_video(path, kept=kept).heard_ns, first.heard_ns)
+    tracks(tmp_path / "cam.mov", [wave(labels_from(0, 80, rate), rate)[: 3 * RATE]])
+    assert probe_video(path, kept=kept).start_label == "00:00:00:00"
+    probe_video(tracks(tmp_path / "mute.mov", [np.zeros(3 * RATE)]), kept=tmp_path / "none")
+    assert not (tmp_path / "none").exists()
