@@ -107,11 +107,12 @@ def _mark(path: Path) -> str:
 
 
 def _known(place: Path, frames: int) -> Heard | None:
-    with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), np.load(place, allow_pickle=False) as data:
+    damaged = (OSError, EOFError, ValueError, KeyError, BadZipFile)
+    with suppress(*damaged), open(place, "rb") as file, np.load(file, allow_pickle=False) as data:
         said, times = json.loads(str(data["said"])), data["times_ns"]
         if times.shape == (frames,) and times.dtype == np.int64:
             return Ltc(times, said["label"], Fraction(said["rate"]), said["jumps"]), tuple(said["notes"])
-    return None  # not there, or damaged
+    return None
 
 
 def _keep(place: Path, heard: Ltc, notes: Sequence[str]) -> None:
