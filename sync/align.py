@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numba import njit
 
-from sync.clock import Clock, ClockMode, ClockState, fit_clock, guess_drift, measure_clock
+from sync.clock import FEWEST_FRAMES, Clock, ClockMode, ClockState, fit_clock, guess_drift, measure_clock
 from sync.probe import CONTAINER_TIMES
 from sync.timecode import Timecodes
 from sync.tree import FrameTree, in_order, merge_mutual, merge_nearest, whole_file, write_whole
@@ -261,13 +261,22 @@ def align(timecodes: Mapping[str, Timecodes], options: AlignOptions | None = Non
         options: None means the defaults.
 
     Raises:
-        ValueError: no cameras, an unknown reference, no frame period to derive a tolerance from, frames of no other
-            camera within the tolerance of the reference's, or no instant at which every camera has a frame.
+        ValueError: no cameras, a clock that stood still, an unknown reference, no frame period to derive a tolerance
+            from, frames of no other camera within the tolerance of the reference's, or no instant at which every camera
+            has a frame.
     """
     options = options or AlignOptions()
     if not timecodes:
         raise ValueError("alignment needs the timecodes of at least one camera, but got none")
     times = {camera: _in_order(camera, codes)[0] for camera, codes in timecodes.items()}
+    if stopped := [
+        camera for camera, codes in timecodes.items() if len(codes) >= FEWEST_FRAMES and len(times[camera]) == 1
+    ]:
+        raise ValueError(
+            f"{', '.join(stopped)} must have a timecode for each frame, but all lines of a camera say the same time, "
+            f"{times[stopped[0]][0]} ns: its clock stood still; re-export the times, or list the camera under 'ignore' "
+            "in capture.toml"
+        )
     reference = _named_reference(times, options.reference) or choose_reference(times)
     tolerance = _tolerance(times, reference, options)
     fitted = _fit_clocks(times, reference) if options.clock is ClockMode.TRIGGERED else None

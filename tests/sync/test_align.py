@@ -366,3 +366,12 @@ def test_groups_check_their_shapes() -> None:
         FrameGroups(("a", "b"), "a", times, np.zeros((3, 1), np.int32), np.zeros((3, 2), np.int64))
     with pytest.raises(ValueError, match="'c' must be one of"):
         FrameGroups(("a",), "c", times, np.zeros((3, 1), np.int32), np.zeros((3, 1), np.int64))
+
+
+def test_a_clock_that_stood_still_is_named():
+    still = Timecodes(np.full(20, 5_000, np.int64), np.arange(20))
+    moving = Timecodes(np.arange(20) * 33_000_000, np.arange(20))
+    with pytest.raises(
+        ValueError, match=r"^b must have a timecode for each frame, but all lines .* 5000 ns: its clock"
+    ):
+        align({"a": moving, "b": still, "c": moving})
