@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -139,22 +140,37 @@ def whole_rig(cameras: int, frames: int, seed: int, repeats: int) -> dict[str, f
             files[camera].write_text("".join(lines))
         timecodes: dict[str, Timecodes] = {camera: read_timecodes(path) for camera, path in files.items()}
         groups, report = align(timecodes)
-        index = build_index(timecodes)
         out = Path(folder) / "sync"
         steps: dict[str, Callable[[], Any]] = {
             "parse": lambda: [read_timecodes(path) for path in files.values()],
             "index": lambda: build_index(timecodes),
             "align_trusted": lambda: align(timecodes),
             "align_triggered": lambda: align(timecodes, AlignOptions(clock=ClockMode.TRIGGERED)),
-            "save_index": lambda: save_index(index, out),
+            "save_index": lambda: save_index(timecodes, None, out),
             "load_index": lambda: load_index(out),
             "save_groups": lambda: groups.save(out, report),
             "load_groups": lambda: type(groups).load(out),
         }
         seconds = {name: best_seconds(work, repeats) for name, work in steps.items()}
         sizes = {name: (out / name).stat().st_size for name in ("groups.arrow", "sync.json")}
+        with get_context("spawn").Pool(1, maxtasksperchild=1) as fresh:
+            peaks = {
+                f"{mode} peak bytes": fresh.apply(peak_bytes, (Path(folder), mode))
+                for mode in (ClockMode.TRUSTED, ClockMode.TRIGGERED)
+            }
     count = sum(len(codes) for codes in timecodes.values())
-    return {"timecodes": count, **seconds, **{f"{name} bytes": size for name, size in sizes.items()}}
+    return {"timecodes": count, **seconds, **{f"{name} bytes": size for name, size in sizes.items()}, **peaks}
+
+
+def peak_bytes(folder: Path, clock: ClockMode) -> int:
+    """Most memory that this process, a fresh one, held once the files of a folder are parsed, aligned and saved."""
+    timecodes = {path.stem: read_timecodes(path) for path in sorted(folder.glob("*.txt"))}
+    groups, report = align(timecodes, AlignOptions(clock=clock))
+    out = folder / clock
+    groups.save(out, report)
+    save_index(timecodes, report.clocks, out)
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
 
 
 def print_tables(rows: list[dict[str, Any]], rig: dict[str, float]) -> None:

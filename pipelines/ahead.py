@@ -1,13 +1,15 @@
 """What a run would do: what of it is there, what would run, what is spared and why, and what all of it takes.
 
-Looks at captures and stores, and changes neither; only the seconds' look at the machine is new each time.
+Looks at captures and stores, and changes neither. Frames are matched as a run matches them, in a folder that is thrown
+away, so that what a run refuses is refused here; then comes the look at the machine, of seconds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from packuv.lpips import lacking
 from packuv.motion import MotionBackend
@@ -15,14 +17,18 @@ from packuv.progress import Progress, no_progress
 from pipelines.choice import affordable, check_judges
 from pipelines.disk import free_bytes
 from pipelines.events import Event, Journal
-from pipelines.forecast import Forecast, Size, forecast, machine_of, question_of, size_of
+from pipelines.forecast import Forecast, Size, forecast, machine_of, question_of
 from pipelines.options import SequenceOptions
-from pipelines.process import find_sequence, jobs_at_once, jobs_of, options_of, plan_of, points_of, walk
+from pipelines.process import There, find_sequence, jobs_at_once, jobs_of, options_of, plan_of, points_of, walk
 from pipelines.request import STAGES, RunRequest
-from pipelines.space import check_room, missing_bytes
+from pipelines.space import check_room, missing_bytes, size_found
 from pipelines.stages import Made
+from pipelines.stages import Sequence as Stages
 from sync.capture import Capture
+from tasks.artefacts.digests import Signature
+from tasks.artefacts.originals import Originals
 from tasks.artefacts.store import Store
+from tasks.artefacts.workshop import Workshop
 from tasks.stages.plan import Plan
 
 LAST_OF = {
@@ -87,12 +93,12 @@ class Ahead:
 
 
 def look_ahead(request: RunRequest, *, progress: Progress = no_progress) -> Ahead:
-    """What this request would do now. Raises ValueError or FileNotFoundError for bad input."""
+    """What this request would do now. Raises ValueError or FileNotFoundError for bad input, as the run itself would."""
     capture, jobs = find_sequence(request), jobs_of(request)
-    plan = plan_of(request, capture)
+    plan, points = plan_of(request, capture), points_of(request, capture)
     check_judges(request, plan.held_out)
-    size, points = size_of(capture, plan), points_of(request, capture)
     root = Path(request.out) / capture.name / "store"
+    size = _size(request, capture, plan, root, progress)
     asked = points or {request.preset: options_of(request, capture, request.preset)}
     question = question_of(plan, size, tuple(asked.values()))
     machine = machine_of(root.parent, question, jobs, jobs_at_once(request), afresh=not points, progress=progress)
@@ -112,6 +118,43 @@ def look_ahead(request: RunRequest, *, progress: Progress = no_progress) -> Ahea
         machine.probe.moving,
         root,
     )
+
+
+class _Passing(Journal):
+    """Says how far a stage is to whoever watches the whole look."""
+
+    def __init__(self, progress: Progress) -> None:
+        super().__init__()
+        self._progress = progress
+
+    def moved(self, label: str, done: float, total: float, note: str = "") -> None:
+        self._progress(done, total, f"{label} {note}".rstrip())
+
+
+class _Unread(Originals):
+    """A capture whose files are not read for their digests: nothing that is made of it is kept."""
+
+    def digests(
+        self, files: Mapping[str, Path], progress: Callable[[float, float, str], None] = lambda *_: None
+    ) -> dict[str, str]:
+        return dict.fromkeys(files, "unread")
+
+    def look(self) -> dict[str, Signature]:
+        return {}
+
+
+def _size(request: RunRequest, capture: Capture, plan: Plan, root: Path, progress: Progress) -> Size:
+    """How much there is to process, of frames that are matched as the run would match them, unless it did already."""
+    matching = replace(request, stop_after="sync", max_minutes=None, target_psnr=None)
+    made = walk(matching, (), Journal())[0].get("sync") if root.is_dir() else None
+    if made is not None:
+        return size_found(Store(root).path(made), plan)
+    jobs, options = jobs_of(request), options_of(request, capture, request.preset)
+    with TemporaryDirectory(prefix="packuv-plan-") as folder:
+        originals = _Unread(capture, Path(folder) / "file_digests.json")
+        workshop = Workshop(Store(Path(folder) / "store"), originals, jobs, _Passing(progress))
+        stages = Stages(workshop, plan, options, lambda stage: There(workshop.make(stage)), Made())
+        return size_found(workshop.path(stages.matched()), plan)
 
 
 def _steps(expected: Forecast, made: Made, store: Store) -> Iterator[Step]:

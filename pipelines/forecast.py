@@ -182,7 +182,11 @@ def minutes_text(minutes: float) -> str:
 def size_of(capture: Capture, plan: Plan) -> Size:
     """Of what a plan means to process; reads the videos' packets. Raises what `probe_video` raises."""
     return size_told(
-        {name: (video.width, video.height, video.frame_count) for name, video in probe_capture(capture).items()}, plan
+        {
+            name: (video.width, video.height, video.frame_count)
+            for name, video in probe_capture(capture, listen=False).items()
+        },
+        plan,
     )
 
 

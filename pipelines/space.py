@@ -24,7 +24,7 @@ def check_space(workshop: Workshop, plan: Plan, options: SequenceOptions, groups
     What lies in the store counts as written by this run, so that a run that stopped may go on where it fits.
     """
     root = workshop.store.root
-    check_room(root, store_bytes(size_found(workshop, plan, groups), options))
+    check_room(root, store_bytes(size_found(workshop.path(groups), plan), options))
 
 
 def check_room(root: Path, needed: float) -> None:
@@ -47,8 +47,12 @@ def missing_bytes(root: Path, needed: float) -> float:
     return max(0.0, MARGIN * needed - (used_bytes(root) if root.is_dir() else 0))
 
 
-def size_found(workshop: Workshop, plan: Plan, groups: Key) -> Size:
-    """Of a synchronized capture, whose instants are known."""
-    instants = len(selected(FrameGroups.load(workshop.path(groups)), plan.first, plan.stop))
-    videos = read_videos(workshop.path(groups))
-    return Size(instants, tuple((videos[name]["width"], videos[name]["height"]) for name in plan.fitted))
+def size_found(groups: Path, plan: Plan) -> Size:
+    """Of a synchronized capture, whose instants are known; raises ValueError where the plan asks for none of them."""
+    instants = len(selected(FrameGroups.load(groups), plan.first, plan.stop))
+    videos = read_videos(groups)
+    fitted, held_out = (
+        tuple((videos[name]["width"], videos[name]["height"]) for name in names)
+        for names in (plan.fitted, plan.held_out)
+    )
+    return Size(instants, fitted, held_out)

@@ -157,7 +157,8 @@ class Sequence:
             pictures=self.options.pictures,
         )
 
-    def _synchronize(self) -> None:
+    def matched(self) -> Key:
+        """Which frames belong together; raises ValueError or FileNotFoundError for what a run refuses until then."""
         capture = find_capture(self.plan.capture)
         find_plate(capture)  # whose absence should not show hours later
         find_masks(capture)  # likewise
@@ -166,6 +167,10 @@ class Sequence:
             starts = self._make(find_starts(self.workshop, options.motion, options.pictures.transfer))
         groups = self._make(synchronize(self.workshop, options.sync, starts))
         check_masks(capture, read_videos(self.workshop.path(groups)))
+        return groups
+
+    def _synchronize(self) -> None:
+        groups = self.matched()
         check_space(self.workshop, self.plan, self.options, groups)
         self.synchronized(groups)
 

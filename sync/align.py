@@ -17,15 +17,17 @@ import numpy as np
 import pyarrow as pa
 from numba import njit
 
-from sync.clock import Clock, ClockMode, ClockState, fit_clock, guess_drift, measure_clock
+from sync.clock import FEWEST_FRAMES, Clock, ClockMode, ClockState, fit_clock, guess_drift, measure_clock
 from sync.probe import CONTAINER_TIMES
 from sync.timecode import Timecodes
-from sync.tree import FrameTree, merge_mutual, merge_nearest, write_whole
+from sync.tree import FrameTree, in_order, merge_mutual, merge_nearest, whole_file, write_whole
 
 SCHEMA = 1
 """Version of sync.json and groups.arrow."""
 JUMP_PERIODS = 10
 """A gap longer than this is a pause or a stall, counted as a jump and not as that many dropped frames."""
+RATES_APART = 0.1
+"""Share by which a camera's frame period differs from the reference's for it to film at another rate"""
 HISTOGRAM_BINS = 20
 MOST_FRAMES = 2**14
 """Frames of a camera, evenly spaced, that tell how its clock runs: an error of milliseconds averages out to
@@ -80,11 +82,12 @@ class FrameGroups:
     def save(self, folder: Path, report: SyncReport | None = None) -> None:
         """Write `groups.arrow`, then `sync.json` with the report, into `folder` (docs/sync.md)."""
         folder.mkdir(parents=True, exist_ok=True)
-        sink = pa.BufferOutputStream()
-        table = self._table()
-        with pa.ipc.new_file(sink, table.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as writer:
+        table, options = self._table(), pa.ipc.IpcWriteOptions(compression="zstd")
+        with (
+            whole_file(folder / "groups.arrow") as file,
+            pa.ipc.new_file(file, table.schema, options=options) as writer,
+        ):
             writer.write_table(table)
-        write_whole(folder / "groups.arrow", sink.getvalue().to_pybytes())
         data = {
             "schema": SCHEMA,
             "cameras": list(self.cameras),
@@ -127,7 +130,7 @@ class FrameGroups:
 
     def _table(self) -> pa.Table:
         """Residuals take 32 bits unless one exceeds the two seconds that fit."""
-        widest = int(np.abs(self.residuals_ns).max(initial=0))
+        widest = max(int(self.residuals_ns.max(initial=0)), -int(self.residuals_ns.min(initial=0)))
         kind = np.int32 if widest < 1 << 31 else np.int64
         columns = {"time_ns": self.times_ns}
         for column, name in enumerate(self.cameras):
@@ -258,21 +261,27 @@ def align(timecodes: Mapping[str, Timecodes], options: AlignOptions | None = Non
         options: None means the defaults.
 
     Raises:
-        ValueError: no cameras, an unknown reference, no frame period to derive a tolerance from, frames of no other
-            camera within the tolerance of the reference's, or no instant at which every camera has a frame.
+        ValueError: no cameras, a clock that stood still, an unknown reference, no frame period to derive a tolerance
+            from, frames of no other camera within the tolerance of the reference's, or no instant at which every camera
+            has a frame.
     """
     options = options or AlignOptions()
     if not timecodes:
         raise ValueError("alignment needs the timecodes of at least one camera, but got none")
-    index = build_index(timecodes)
-    times = {camera: tree.items()[0] for camera, tree in index.items()}
+    times = {camera: _in_order(camera, codes)[0] for camera, codes in timecodes.items()}
+    if stopped := [
+        camera for camera, codes in timecodes.items() if len(codes) >= FEWEST_FRAMES and len(times[camera]) == 1
+    ]:
+        raise ValueError(
+            f"{', '.join(stopped)} must have a timecode for each frame, but all lines of a camera say the same time, "
+            f"{times[stopped[0]][0]} ns: its clock stood still; re-export the times, or list the camera under 'ignore' "
+            "in capture.toml"
+        )
     reference = _named_reference(times, options.reference) or choose_reference(times)
     tolerance = _tolerance(times, reference, options)
     fitted = _fit_clocks(times, reference) if options.clock is ClockMode.TRIGGERED else None
-    if fitted is not None:
-        index = build_index(timecodes, fitted)
-    groups = _match(index, reference, tolerance, mutual=options.mutual)
-    if len(times) > 1 and (np.delete(groups.frames, groups.cameras.index(reference), axis=1) < 0).all():
+    groups = _match(timecodes, fitted, reference, tolerance, mutual=options.mutual)
+    if len(times) > 1 and (np.delete(_counts(groups), groups.cameras.index(reference)) == 0).all():
         raise ValueError(
             f"no frame of any camera lies within {tolerance} ns of a frame of {reference!r}; "
             f"the cameras' times span {_spans(times)}: do they share a clock, an epoch and a unit?"
@@ -293,21 +302,14 @@ def align(timecodes: Mapping[str, Timecodes], options: AlignOptions | None = Non
 
 def build_index(timecodes: Mapping[str, Timecodes], clocks: Mapping[str, Clock] | None = None) -> dict[str, FrameTree]:
     """AVL index of each camera (algorithm 1), by time on the reference clock where `clocks` are given."""
-    index = {}
-    for camera, codes in timecodes.items():
-        times = codes.times_ns if clocks is None else clocks[camera].to_reference(codes.times_ns)
-        try:
-            index[camera] = FrameTree(times, codes.indices)
-        except ValueError as error:
-            raise ValueError(f"camera {camera!r}: {error}; number its lines with frame_numbers first") from None
-    return index
+    return {camera: FrameTree(*_in_order(camera, codes, clocks)) for camera, codes in timecodes.items()}
 
 
-def save_index(index: Mapping[str, FrameTree], folder: Path) -> None:
-    """Write `<folder>/index/<camera>.avl` for each camera."""
+def save_index(timecodes: Mapping[str, Timecodes], clocks: Mapping[str, Clock] | None, folder: Path) -> None:
+    """Write `<folder>/index/<camera>.avl` for each camera: `build_index`, of which one tree is in memory at a time."""
     (folder / "index").mkdir(parents=True, exist_ok=True)
-    for camera, tree in index.items():
-        tree.save(folder / "index" / f"{camera}.avl")
+    for camera, codes in timecodes.items():
+        FrameTree(*_in_order(camera, codes, clocks)).save(folder / "index" / f"{camera}.avl")
 
 
 def load_index(folder: Path) -> dict[str, FrameTree]:
@@ -415,8 +417,7 @@ def _find_drifts(times: Mapping[str, np.ndarray], reference: str) -> dict[str, C
 
 def _never_complete(groups: FrameGroups, times: Mapping[str, np.ndarray], tolerance: int) -> str:
     """Why no instant is complete, as far as can be told."""
-    there = (groups.frames >= 0).sum(axis=0)
-    fewest = sorted(zip(there.tolist(), groups.cameras, strict=True))[:4]
+    fewest = sorted(zip(_counts(groups).tolist(), groups.cameras, strict=True))[:4]
     counts = ", ".join(f"{camera} has one at {count} of {len(groups)}" for count, camera in fewest)
     return (
         f"no instant has a frame of every camera within {tolerance} ns: {counts}; the cameras' times span "
@@ -432,13 +433,38 @@ def _measure_clocks(groups: FrameGroups) -> dict[str, Clock]:
     return {**clocks, groups.reference: Clock(ClockState.REFERENCE, int(groups.times_ns[0]))}
 
 
-def _match(index: Mapping[str, FrameTree], reference: str, tolerance: int, *, mutual: bool) -> FrameGroups:
-    cameras, instants = tuple(index), index[reference].items()[0]
+def _in_order(
+    camera: str, codes: Timecodes, clocks: Mapping[str, Clock] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct times of a camera, int64 [n], and their frames, as its index has them; on the reference clock where
+    `clocks` are given. Not copied where they are that already."""
+    try:
+        return in_order(
+            codes.times_ns if clocks is None else clocks[camera].to_reference(codes.times_ns), codes.indices
+        )
+    except ValueError as error:
+        raise ValueError(f"camera {camera!r}: {error}; number its lines with frame_numbers first") from None
+
+
+def _counts(groups: FrameGroups) -> np.ndarray:
+    """Instants at which each camera has a frame, int64 [C]."""
+    return np.array([np.count_nonzero(column >= 0) for column in groups.frames.T])
+
+
+def _match(
+    timecodes: Mapping[str, Timecodes],
+    clocks: Mapping[str, Clock] | None,
+    reference: str,
+    tolerance: int,
+    *,
+    mutual: bool,
+) -> FrameGroups:
+    cameras, instants = tuple(timecodes), _in_order(reference, timecodes[reference], clocks)[0]
     frames = np.empty((len(instants), len(cameras)), np.int32, order="F")  # they are filled by camera
     residuals = np.empty((len(instants), len(cameras)), np.int64, order="F")
     merge = merge_mutual if mutual else merge_nearest
     for column, camera in enumerate(cameras):
-        times, numbers = index[camera].items()
+        times, numbers = _in_order(camera, timecodes[camera], clocks)
         positions, residuals[:, column] = merge(times, instants, tolerance)
         frames[:, column] = np.where(positions >= 0, numbers[positions], -1)
     return FrameGroups(cameras, reference, instants, frames, residuals)
@@ -523,6 +549,11 @@ def _notes(report: CameraReport, sync: SyncReport) -> list[str]:
             "fires all cameras, its clock runs wrong and so do the pairs: set clock = 'triggered' in capture.toml"
         )
     notes += [f"{name}: {count} {kind} timecodes" for kind, count in counts.items() if count]
+    if report.period_ns and abs(report.period_ns / max(sync.period_ns, 1) - 1) > RATES_APART:
+        notes.append(
+            f"{name}: it films a frame each {report.period_ns / 1e6:.3g} ms, {sync.reference}, whose frames are the "
+            f"instants, each {sync.period_ns / 1e6:.3g} ms, so it has one at {100 * report.matched_share:.0f} % of them"
+        )
     if report.jumps:
         notes.append(f"{name}: {report.jumps} pauses of more than {JUMP_PERIODS} frame periods")
     if report.matched == 0:

@@ -279,8 +279,15 @@ def check_masks(capture: Capture, videos: Mapping[str, Mapping[str, Any]]) -> No
             )
 
 
-def probe_capture(capture: Capture, tell: Callable[[int, int, str], None] = lambda *_: None) -> dict[str, VideoInfo]:
-    """What the video of each camera holds; `tell` hears how many are read, of how many, and which is next.
+def probe_capture(
+    capture: Capture,
+    tell: Callable[[int, int, str], None] = lambda *_: None,
+    *,
+    listen: bool = True,
+    kept: Path | None = None,
+) -> dict[str, VideoInfo]:
+    """What the video of each camera holds; `tell` hears how many are read, of how many, and which is next. `listen` for
+    LTC, which takes the reading of whole sound tracks where there is some, once where it is `kept`, see `hear_ltc`.
 
     Pictures, which hold no times, run at the `fps` of capture.toml, or at the rate of most videos, or at 30. Their
     numbers count from the lowest that any camera begins with, as videos count from their first frame.
@@ -295,7 +302,7 @@ def probe_capture(capture: Capture, tell: Callable[[int, int, str], None] = lamb
         tell(len(infos), len(capture.videos), camera)
         videos = [info.rate for name, info in infos.items() if name not in folders]
         rate = capture.settings.fps or (Counter(videos).most_common(1)[0][0] if videos else None)
-        infos[camera] = probe_video(capture.videos[camera], rate=rate, origin=origin)
+        infos[camera] = probe_video(capture.videos[camera], rate=rate, origin=origin, listen=listen, kept=kept)
     return {camera: infos[camera] for camera in capture.cameras}
 
 
@@ -348,11 +355,34 @@ def load_timecodes(
         ValueError: some cameras have timecode files and others have not (their times would not be comparable), a file
             does not parse, or its lines do not fit the frames of the video.
     """
-    told = _told_timecodes(capture, infos)
+    told, clock = _told_timecodes(capture, infos), capture.settings.clock if clock is None else clock
     if not capture.timecodes:
+        if clock is not ClockMode.CONTENT:
+            told = _beside_labels(told, infos)
         begun = {name: infos[name].begun_ns for name in told if not infos[name].start_label}
         told = {camera: codes.noting(*_begun_notes(camera, begun)) for camera, codes in told.items()}
-    return with_offsets(capture, told, capture.settings.clock if clock is None else clock)
+    return with_offsets(capture, told, clock)
+
+
+def _beside_labels(told: dict[str, Timecodes], infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
+    """Where some containers have labels and others none: that is said, or raised as ValueError where the times of
+    those without lie beside all of the others."""
+    labelled = [camera for camera in told if infos[camera].start_label]
+    bare = [camera for camera in told if not infos[camera].start_label]
+    if not labelled or not bare:
+        return told
+    first, last = (pick(pick(told[name].times_ns) for name in labelled) for pick in (min, max))
+    apart = [name for name in bare if told[name].times_ns.max() < first or told[name].times_ns.min() > last]
+    if apart:
+        heard = "".join(f"; {note}" for name in apart for note in infos[name].notes)
+        raise ValueError(
+            f"{', '.join(apart)} must have a start label or LTC that is heard on a sound track, as "
+            f"{', '.join(labelled)} have, but their times count from 0 where the others' are times of day{heard}; add "
+            "timecodes/ for all, set clock = 'content' in capture.toml, by which pictures and sound tell when each "
+            "began, or list them under 'ignore'"
+        )
+    note = f"it has no start label, as {', '.join(labelled)} have: its times count from 0"
+    return {name: codes.noting(note) if name in bare else codes for name, codes in told.items()}
 
 
 def load_durations(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
@@ -362,14 +392,16 @@ def load_durations(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str
 
 def with_offsets(capture: Capture, timecodes: Mapping[str, Timecodes], clock: ClockMode) -> dict[str, Timecodes]:
     """Timecodes with what `offsets_of` adds to them; what capture.toml says is said by camera."""
-    said, read = capture.settings.time_offset_s, _read_offsets(capture, clock)
-    moved = dict(timecodes)
-    for camera, codes in timecodes.items():
-        if own := said.get(camera):
-            moved[camera] = codes.moved(int(own * NANOSECONDS))
-        if own := read.get(camera):
-            moved[camera] = moved[camera].moved(int(own * NANOSECONDS), told=False)
-    return moved
+    said, added = capture.settings.time_offset_s, offsets_of(capture, clock)
+    return {
+        camera: codes.moved(int(added.get(camera, 0) * NANOSECONDS)).noting(*_moved_notes(said.get(camera)))
+        for camera, codes in timecodes.items()
+    }
+
+
+def _moved_notes(said: Decimal | None) -> Iterator[str]:
+    if said:
+        yield f"{float(said):+.6g} s are added to its times, as time_offset_s in capture.toml says"
 
 
 def offsets_of(capture: Capture, clock: ClockMode) -> dict[str, Decimal]:

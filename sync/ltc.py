@@ -3,29 +3,42 @@ in its middle, too."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import islice
 from pathlib import Path
+from zipfile import BadZipFile
 
-import av
 import numpy as np
 
+from sync.audio import Track, sound_tracks
 from sync.timecode import NANOSECONDS, frame_to_label, labels_to_ns
+from sync.tree import whole_file
 
+KEPT = 1
+"""Version of the files of what was heard"""
 RATE = 48_000
 """Samples a second that are read"""
 LOOK_S, BLOCK_S = 10.0, 60.0
 """Of a track, in which there must be labels for it to be read to its end; and what is read at once then"""
-FEWEST_LABELS = 10
+LOOKS, SILENT = 12, 1e-6
+"""Times so long that are looked at while all is silent, which is below the least step of 16 bits"""
+FEWEST_LABELS, MOST = 10, 0.5
+"""For it to be labels; and the share of them that must go on with the sound, or most are misread"""
 LONG_S = 16.5 / RATE
 """Between half a bit at 24 frames a second, 260 us, and a whole one at 30, 417 us"""
 LONGEST_S = 2 * LONG_S
 """Longer than any bit: silence, or something else"""
 WHILE = RATE // 20
 """Samples in which a wave's middle and height are measured"""
+HUM = RATE // 500
+"""Samples of four bits and more, over which a mean is taken off"""
+APART_S = 1.5
+"""Between the labels of two channels, which are compared without their rate, for them to disagree"""
 HYSTERESIS, QUIET = 0.1, 0.2
 """Of the wave's height about there, which noise does not cross; and of its greatest height, below which it is silent"""
 BITS = 80
@@ -65,50 +78,123 @@ class _Labels:
     drop: bool
 
 
-def hear_ltc(path: Path, pts_ns: np.ndarray) -> Ltc | None:
-    """Times of the frames of a video by the LTC on one of its sound channels; None where there is none.
+Heard = tuple[Ltc | None, tuple[str, ...]]
+"""What is heard, None where there is nothing, and what of it a person should know"""
+
+
+def hear_ltc(path: Path, pts_ns: np.ndarray, kept: Path | None = None) -> Heard:
+    """Times of the frames of a video by the LTC on one of its sound channels.
 
     Args:
         pts_ns: int64 [frames], presentation times in the container.
+        kept: folder for what was heard, so that no track with LTC is read twice; None keeps nothing.
     """
-    place = _find(path)
-    if place is None:
-        return None
-    track, channel = place
-    heard = [decode_ltc(samples[channel], start) for start, samples in _blocks(path, track, BLOCK_S)]
-    labels = _joined([found for found in heard if found])
-    rate = _rate(labels) if labels else None
-    return _of_frames(labels, rate, pts_ns) if labels and rate else None
+    place = None if kept is None else kept / f"{_mark(path)}.npz"
+    known = None if place is None else _known(place, len(pts_ns))
+    if known is not None:
+        return known
+    heard, notes = _hear(path, pts_ns)
+    if place is not None and heard is not None:
+        _keep(place, heard, notes)
+    return heard, notes
 
 
-def _find(path: Path) -> tuple[int, int] | None:
-    """The track and channel that begin with labels."""
-    tracks = 0
-    with suppress(av.FFmpegError), av.open(str(path)) as container:
-        tracks = len(container.streams.audio)
-    for track in range(tracks):
-        for start, samples in islice(_blocks(path, track, LOOK_S), 1):
-            for channel, wave in enumerate(samples):
-                if decode_ltc(wave, start):
-                    return track, channel
+def _mark(path: Path) -> str:
+    """Of a file as it is now."""
+    seen = path.stat()
+    words = (KEPT, path.resolve(), seen.st_size, seen.st_mtime_ns, seen.st_ctime_ns, seen.st_ino)
+    return hashlib.sha256("\0".join(map(str, words)).encode()).hexdigest()
+
+
+def _known(place: Path, frames: int) -> Heard | None:
+    damaged = (OSError, EOFError, ValueError, KeyError, BadZipFile)
+    with suppress(*damaged), open(place, "rb") as file, np.load(file, allow_pickle=False) as data:
+        said, times = json.loads(str(data["said"])), data["times_ns"]
+        if times.shape == (frames,) and times.dtype == np.int64:
+            return Ltc(times, said["label"], Fraction(said["rate"]), said["jumps"]), tuple(said["notes"])
     return None
 
 
-def _blocks(path: Path, track: int, seconds: float) -> Iterator[tuple[float, np.ndarray]]:
-    """Start in seconds and samples, float32 [channels, n] at RATE, of a sound track, as far as it is whole."""
-    parts: list[np.ndarray] = []
-    begins, count = 0.0, 0
-    with suppress(av.FFmpegError), av.open(str(path)) as container:
-        stream = container.streams.audio[track]
-        resampler = av.AudioResampler("fltp", stream.layout, RATE)
-        for frame in container.decode(stream):
-            begins = begins if parts or count else float(frame.time or 0.0)
-            parts += [piece.to_ndarray() for piece in resampler.resample(frame)]
-            if sum(part.shape[1] for part in parts) >= seconds * RATE:
-                yield begins + count / RATE, (block := np.concatenate(parts, axis=1))
-                parts, count = [], count + block.shape[1]
-    if parts:
-        yield begins + count / RATE, np.concatenate(parts, axis=1)
+def _keep(place: Path, heard: Ltc, notes: Sequence[str]) -> None:
+    said = {"label": heard.label, "rate": str(heard.rate), "jumps": heard.jumps, "notes": list(notes)}
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(place) as file:
+        np.savez(file, times_ns=heard.times_ns, said=np.array(json.dumps(said)))
+
+
+def _hear(path: Path, pts_ns: np.ndarray) -> Heard:
+    places, unread = _look(path)
+    if not places:
+        return None, tuple(f"{place} carries LTC, but is too distorted to be read; it is not used" for place in unread)
+    first, *others = places
+    heard = [decode_ltc(samples[first.channel], start) for start, samples in first.track.blocks(BLOCK_S, RATE)]
+    labels = _joined([found for found in heard if found])
+    if labels is None:
+        return None, (f"{first} carries LTC, but is too distorted to be read; it is not used",)
+    rate = _rate(labels)
+    if rate is None:
+        per_second = 1 / float(np.median(np.diff(labels.begins_s)))
+        odd = f"{first} carries LTC of {per_second:.4g} labels a second, which is no rate of labels"
+        return None, (f"{odd}: is the sample rate in the file's header right? it is not used",)
+    told = _of_frames(labels, rate, pts_ns)
+    if told is None:
+        return None, (f"{first} carries LTC, but is too distorted to be read; it is not used",)
+    return told, tuple(_place_notes(first, others))
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A channel of a sound track that begins with labels."""
+
+    track: Track
+    channel: int
+    late_s: float
+    """By how much the labels are later than the container's time, nearly"""
+
+    def __str__(self) -> str:
+        return f"channel {self.channel + 1} of sound track {self.track.number + 1}"
+
+
+def _look(path: Path) -> tuple[list[_Place], list[str]]:
+    """Channels that begin with labels, and those that begin with what could be labels."""
+    places, unread = list[_Place](), list[str]()
+    for track in sound_tracks(path):
+        for start, samples in _first_sound(track):
+            for channel, wave in enumerate(samples):
+                if labels := decode_ltc(wave, start):
+                    hours, minutes, seconds, frames = labels.fields[0]
+                    said = (hours * 60 + minutes) * 60 + seconds + frames / 25
+                    places.append(_Place(track, channel, float(said - labels.begins_s[0])))
+                elif len(_words(wave)[0]) >= FEWEST_LABELS:
+                    unread.append(str(_Place(track, channel, 0.0)))
+    return places, unread
+
+
+def _first_sound(track: Track) -> Iterator[tuple[float, np.ndarray]]:
+    """The first block of a track that is not silent: a timecode box may be switched on after the camera."""
+    for start, samples in islice(track.blocks(LOOK_S, RATE), LOOKS):
+        if np.ptp(samples, axis=1).max(initial=0.0) > SILENT:
+            yield start, samples
+            return
+
+
+def label_channels(track: Track) -> set[int]:
+    """Channels of a track that begin with labels, or with what could be labels."""
+    for _, samples in _first_sound(track):
+        return {channel for channel, wave in enumerate(samples) if len(_words(wave)[0]) >= FEWEST_LABELS}
+    return set()
+
+
+def _place_notes(first: _Place, others: Sequence[_Place]) -> Iterator[str]:
+    if first.track.damaged:
+        packets = "packet" if first.track.damaged == 1 else "packets"
+        yield f"{first.track.damaged} {packets} of the sound track with LTC are damaged: its labels go on over them"
+    for other in others:
+        if abs(other.late_s - first.late_s) > APART_S:
+            yield (
+                f"{other} carries LTC, too, which is {other.late_s - first.late_s:+.1f} s from that of {first}; the "
+                "latter is used"
+            )
 
 
 def _joined(found: Sequence[_Labels]) -> _Labels | None:
@@ -120,27 +206,33 @@ def _joined(found: Sequence[_Labels]) -> _Labels | None:
 
 def decode_ltc(samples: np.ndarray, start_s: float = 0.0) -> _Labels | None:
     """Labels in samples, float [n] at RATE; None where there are hardly any."""
-    turns = _turns(samples)
-    bits, starts = _bits(turns)
-    if len(bits) < FEWEST_LABELS * BITS:
+    words, begins, ends = _words(samples)
+    if len(words) < FEWEST_LABELS:
         return None
-    ends = np.flatnonzero((np.lib.stride_tricks.sliding_window_view(bits, len(SYNC)) == SYNC).all(axis=1)) + len(SYNC)
-    ends = ends[ends >= BITS]
-    if len(ends) < FEWEST_LABELS:
-        return None
-    words = bits[ends[:, None] - BITS + np.arange(BITS)]
+    begins = start_s + begins
     fields = np.stack([_field(words, *places) for places in FIELDS.values()], axis=1)
-    begins = start_s + starts[ends - BITS] / RATE
     right = (fields < [24, 60, 60, 30]).all(axis=1) & _whole(begins, ends)
+    if not right.any():
+        return None
     _, minutes, seconds, frames = fields[right].T
     skipped = (minutes % 10 > 0) & (seconds == 0) & (frames < 2)  # by drop-frame counting
     drop = bool(words[right, DROP_FLAG].mean() > 0.5 and not skipped.any())
-    return _consistent(_Labels(begins[right], fields[right], drop)) if right.any() else None
+    return _consistent(_Labels(begins[right], fields[right], drop))
+
+
+def _words(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What ends with a sync word: uint8 [n, BITS], when it begins, float64 [n], seconds, and at which bit it ends."""
+    bits, starts = _bits(_turns(samples))
+    if len(bits) < BITS:
+        return np.zeros((0, BITS), np.uint8), np.zeros(0), np.zeros(0, np.int64)
+    ends = np.flatnonzero((np.lib.stride_tricks.sliding_window_view(bits, len(SYNC)) == SYNC).all(axis=1)) + len(SYNC)
+    ends = ends[ends >= BITS]
+    return bits[ends[:, None] - BITS + np.arange(BITS)], starts[ends - BITS] / RATE, ends
 
 
 def _turns(samples: np.ndarray) -> np.ndarray:
     """Where a wave crosses its middle, float64 [n], in samples; what is far below the usual height does not count."""
-    whole = samples[: len(samples) // WHILE * WHILE].astype(np.float64).reshape(-1, WHILE)
+    whole = _without_hum(samples[: len(samples) // WHILE * WHILE]).reshape(-1, WHILE)
     if not len(whole):
         return np.zeros(0)
     low, high = np.percentile(whole, (5, 95), axis=1)
@@ -154,6 +246,15 @@ def _turns(samples: np.ndarray) -> np.ndarray:
     before, after = sure[turned], sure[turned + 1]
     turns: np.ndarray = before + wave[before] / (wave[before] - wave[after]) * (after - before)
     return turns
+
+
+def _without_hum(samples: np.ndarray) -> np.ndarray:
+    """Less the mean of some bits around, float64 [n]: what is slower than labels, as the hum of mains."""
+    sums = np.concatenate([np.zeros(1), np.cumsum(samples, dtype=np.float64)])
+    middle = np.arange(len(samples))
+    first, stop = np.maximum(middle - HUM // 2, 0), np.minimum(middle + HUM // 2 + 1, len(samples))
+    left: np.ndarray = samples - (sums[stop] - sums[first]) / (stop - first)
+    return left
 
 
 def _bits(turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -213,8 +314,9 @@ def _rate(labels: _Labels) -> Fraction | None:
     return best if fits else None
 
 
-def _of_frames(labels: _Labels, rate: Fraction, pts_ns: np.ndarray) -> Ltc:
-    """Each frame by the label that was heard last when it was shown, the first ones by the first label."""
+def _of_frames(labels: _Labels, rate: Fraction, pts_ns: np.ndarray) -> Ltc | None:
+    """Each frame by the label that was heard last when it was shown, the first ones by the first label; None where
+    most labels are misread."""
     mark = ";" if labels.drop else ":"
     texts = [
         f"{hours:02}:{minutes:02}:{seconds:02}{mark}{frame:02}" for hours, minutes, seconds, frame in labels.fields
@@ -223,7 +325,9 @@ def _of_frames(labels: _Labels, rate: Fraction, pts_ns: np.ndarray) -> Ltc:
     late = said - begins
     runs = np.cumsum(np.abs(np.diff(late, prepend=late[:1])) > NANOSECONDS / 2 / rate)
     believed = np.bincount(runs)[runs] >= FEWEST_LABELS  # fewer in a row that agree are misread
-    late, begins = (late[believed], begins[believed]) if believed.any() else (late, begins)
+    if believed.mean() < MOST:
+        return None
+    late, begins = late[believed], begins[believed]
     times = late[np.maximum(np.searchsorted(begins, pts_ns, side="right") - 1, 0)] + pts_ns
     first = round(Fraction(int(times[0])) * rate / NANOSECONDS)
     jumps = int((np.abs(np.diff(late)) > NANOSECONDS / 2 / rate).sum())

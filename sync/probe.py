@@ -116,12 +116,21 @@ UNTIMED = np.iinfo(np.int64).min
 """pts of a packet without one"""
 
 
-def probe_video(path: Path, *, rate: Fraction | None = None, origin: int | None = None) -> VideoInfo:
+def probe_video(
+    path: Path,
+    *,
+    rate: Fraction | None = None,
+    origin: int | None = None,
+    listen: bool = True,
+    kept: Path | None = None,
+) -> VideoInfo:
     """Count the frames of a video and read their times. A folder is one of numbered pictures.
 
     Args:
         rate: of pictures, which hold no times: numbers per second.
         origin: number of the picture at time 0; None is that of the first one.
+        listen: for LTC on sound tracks, where the container has no label.
+        kept: see `hear_ltc`.
 
     Raises:
         FileNotFoundError: no such file.
@@ -136,7 +145,7 @@ def probe_video(path: Path, *, rate: Fraction | None = None, origin: int | None 
         raise ValueError(f"{path} is empty; copy the recording again")
     try:
         with av.open(str(path)) as container:
-            return _probe(path, container)
+            return _probe(path, container, listen=listen, kept=kept)
     except av.error.FFmpegError as error:
         raise ValueError(f"{path} is no video that FFmpeg can read, or its index is lost: {error.strerror}") from None
 
@@ -163,7 +172,7 @@ def container_timecodes(info: VideoInfo) -> Timecodes:
     return Timecodes(times, numbers, day, f"the container's label {info.start_label}", notes=notes)
 
 
-def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
+def _probe(path: Path, container: av.container.InputContainer, *, listen: bool, kept: Path | None) -> VideoInfo:
     stream = container.streams.best("video")
     name = container.format.name
     if not isinstance(stream, av.VideoStream) or name in PICTURE_FORMATS or name.endswith("_pipe"):
@@ -188,7 +197,7 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
     sides = (stream.width, stream.height)
     width, height = sides[::-1] if look.rotation_deg % 180 else sides
     label, label_rate, odd = _start_label(path, container, stream, rate)
-    heard = None if label else hear_ltc(path, pts_ns)
+    heard, told = (None, ()) if label or not listen else hear_ltc(path, pts_ns, kept)
     return VideoInfo(
         width=width,
         height=height,
@@ -205,7 +214,11 @@ def _probe(path: Path, container: av.container.InputContainer) -> VideoInfo:
         begun_ns=_begun_ns(container.metadata.get("creation_time")),
         odd_label=odd,
         rotation_deg=look.rotation_deg,
-        notes=(*_stream_notes(path, container, stream), *_heard_notes(path, heard)),
+        notes=(
+            *_stream_notes(path, container, stream),
+            *(f"{path.stem}: {note}" for note in told),
+            *_heard_notes(path, heard),
+        ),
     )
 
 

@@ -44,9 +44,10 @@ class Whole:
 
 
 def look_over(request: BatchRequest, *, progress: Progress = no_progress) -> Whole:
-    """What the batch would do now. Raises what `plan_batch` and `look_ahead` raise.
+    """What the batch would do now. Raises what `plan_batch` raises.
 
-    Every sequence that would run is looked at, which takes seconds each.
+    Every sequence that would run is looked at, which takes seconds each. One that its run would refuse has that as its
+    problem, and the others go on, as in the batch.
     """
     steps = plan_batch(with_manifest(request)).steps
     run = sum(step.runs for step in steps)
@@ -55,5 +56,12 @@ def look_over(request: BatchRequest, *, progress: Progress = no_progress) -> Who
     for step in steps:
         if step.runs:
             progress(sum(ahead is not None for _, ahead in rows), run, step.name)
-        rows.append((step, look_ahead(replace(step.request, cores=cores)) if step.runs else None))
+        rows.append(_looked_at(step, cores) if step.runs else (step, None))
     return Whole(tuple(rows), at_once, Path(request.out))
+
+
+def _looked_at(step: Step, cores: int) -> tuple[Step, Ahead | None]:
+    try:
+        return step, look_ahead(replace(step.request, cores=cores))
+    except (ValueError, FileNotFoundError) as error:
+        return replace(step, why=str(error), problem=str(error)), None

@@ -7,7 +7,6 @@ cameras that stand apart agree to about a frame, not better.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations, islice
 from pathlib import Path
@@ -15,11 +14,16 @@ from pathlib import Path
 import av
 import numpy as np
 
+from sync.audio import Track, sound_tracks
+from sync.ltc import label_channels
+
 RATE, HOP = 8000, 8
 """Samples a second that are read, and of one step of loudness: 1 ms"""
 STEP_S = HOP / RATE
 MOST_SECONDS = 300.0
 """That are read of a recording, from its start"""
+BLOCK_S = 20.0
+"""Read at once"""
 WHILE_S = 0.5
 """Loudness counts beside its mean over this long"""
 REACH_S = 60.0
@@ -42,25 +46,41 @@ class Sound:
 
 
 def hear(video: Path) -> Sound | None:
-    """The sound of a video; None where it has none."""
+    """The first sound track of a video that is not silent, without channels of timecode; None where it has none."""
+    tracks = sound_tracks(video)
+    if not tracks:
+        return None
     with av.open(str(video)) as container:
-        if not container.streams.audio or not container.streams.video:
+        if not container.streams.video:
             return None
         picture = container.streams.video[0]
         shown = [packet.pts for packet in islice(container.demux(picture), FIRST_PACKETS) if packet.pts is not None]
         first_s = float(min(shown, default=0) * (picture.time_base or 0))
-    with av.open(str(video)) as container:
-        stream, resampler = container.streams.audio[0], av.AudioResampler("flt", "mono", RATE)
-        begins, parts, count = None, [np.zeros(0, np.float32)], 0
-        with suppress(av.FFmpegError):  # damaged from there on
-            for frame in container.decode(stream):
-                begins = float(frame.time or 0.0) if begins is None else begins
-                for piece in resampler.resample(frame):
-                    parts.append(piece.to_ndarray().ravel().astype(np.float32))
-                    count += parts[-1].size
-                if count >= MOST_SECONDS * RATE:
-                    break
-    return None if begins is None else Sound(begins - first_s, loudness(np.concatenate(parts)))
+    heard = None
+    for track in tracks:
+        begins, samples = _room(track)
+        heard = heard or Sound(begins - first_s, np.zeros(0, np.float32))
+        if len(level := loudness(samples)):
+            return Sound(begins - first_s, level)
+    return heard
+
+
+def _room(track: Track) -> tuple[float, np.ndarray]:
+    """When a track begins, seconds, and its sound, float32 [n] at `RATE`; silence where it has a gap."""
+    labels = label_channels(track)
+    begins, whole = 0.0, np.zeros(round(MOST_SECONDS * RATE), np.float32)
+    end = 0
+    for start, samples in track.blocks(BLOCK_S, RATE, mono=not labels):
+        begins = start if not end else begins
+        voices = [wave for channel, wave in enumerate(samples) if channel not in labels]
+        first = max(0, round((start - begins) * RATE))
+        room = whole[first : first + samples.shape[1]]
+        if voices:
+            room[:] = np.mean(voices, axis=0)[: len(room)]
+        end = max(end, first + len(room))
+        if end >= len(whole):
+            break
+    return begins, whole[:end]
 
 
 def loudness(samples: np.ndarray) -> np.ndarray:

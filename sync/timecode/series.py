@@ -52,10 +52,9 @@ class Timecodes:
     def __len__(self) -> int:
         return len(self.times_ns)
 
-    def moved(self, by_ns: int, *, told: bool = True) -> Timecodes:
-        """The same with so much added to the times, and that said unless somebody else tells it."""
-        note = f"{by_ns / 1e9:+.6g} s are added to its times, as time_offset_s in capture.toml says"
-        return replace(self, times_ns=self.times_ns + by_ns).noting(*(note,) * told)
+    def moved(self, by_ns: int) -> Timecodes:
+        """The same with so much added to the times."""
+        return replace(self, times_ns=self.times_ns + by_ns) if by_ns else self
 
     def begun(self, start_ns: int, told: str) -> Timecodes:
         """The same counted from the first one, which was filmed at `start_ns`; `told` says who says so."""

@@ -10,6 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from sync.content import Content
 from tasks.report.facts import ReportInput, StageOutcome, by_camera, mean_by_frame, mean_of, still_trend
 from tasks.report.limits import LIMITS, Limits
 
@@ -142,6 +143,7 @@ def _content_findings(report: ReportInput) -> Iterator[Finding]:
                 cure=f"Set time_offset_s = {{ {move} }} in capture.toml, and run again.",
                 camera=camera,
             )
+    yield from _alike(content)
     if content.undecided:
         names = content.undecided
         whose = "times of any camera" if len(names) == len(content.cameras) else f"times of {', '.join(names)}"
@@ -151,6 +153,24 @@ def _content_findings(report: ReportInput) -> Iterator[Finding]:
         )
         cure = "Try content.reach=60; have somebody clap or walk through the volume in the next take."
         yield Finding("sync", text, Severity.NOTE, cure)
+
+
+def _alike(content: Content) -> Iterator[Finding]:
+    """Cameras that lie equally: who is right, pictures cannot tell."""
+    told = {name: worst[1] for name in content.cameras if (worst := content.worst(name))}
+    frames = {name: round(offset.away) for name, offset in told.items() if offset.lies}
+    for number, count in Counter(frames.values()).items():
+        if count > 1:
+            names = ", ".join(name for name, own in frames.items() if own == number)
+            yield Finding(
+                "sync",
+                f"{names} lie by about the same {number:+d} frames, {count} of {len(content.cameras)} cameras: "
+                "pictures tell that two groups differ, and the larger one is taken to be right; if half of the "
+                "cameras or more are wrong alike, it is the others that are named.",
+                Severity.NOTE,
+                "See whether the cameras of either group have something in common, such as a recorder or a label set "
+                "by hand, before moving their times.",
+            )
 
 
 def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:

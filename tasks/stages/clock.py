@@ -23,7 +23,7 @@ from sync.probe import VideoInfo
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import calibration_files
-from tasks.stages.content import activity_of
+from tasks.stages.content import LONGEST_STEP, activity_of
 from tasks.stages.footage import lens_camera
 from tasks.stages.synchronize import STARTS
 
@@ -39,7 +39,7 @@ WINDOW_SECONDS = 20.0
 class FindStarts(Stage):
     """Find when each camera began to film, by what moves or sounds: starts.json, in seconds by camera."""
 
-    name, version = "clock", 4
+    name, version = "clock", 5
     videos: Files
     timecodes: Files
     calibration: Files | None
@@ -57,7 +57,7 @@ class FindStarts(Stage):
         said = capture.settings
         if (said.fps, said.timecode_column) != (self.fps, self.timecode_column):
             raise ValueError(f"settings of {capture.folder} changed while they were read; run the command again")
-        infos = probe_capture(capture, work.progress)
+        infos = probe_capture(capture, work.progress, listen=False)
         times = {name: codes.times_ns - codes.times_ns.min() for name, codes in load_durations(capture, infos).items()}
         frames, period_s = _rows(times)
         answers = self._answers(capture, infos, frames, period_s, work)
@@ -71,8 +71,8 @@ class FindStarts(Stage):
             raise ValueError(
                 f"the pictures do not tell when {', '.join(unsure)} began to film: in their middle {WINDOW_SECONDS:g} "
                 "s too little moves that several cameras see, or they began further than half of that apart, and they "
-                f"have no sound in common; {cure}timecodes, cut the videos to about a common start, or leave these "
-                "cameras out with 'ignore' in capture.toml"
+                f"have no sound in common{_slow(times)}; {cure}timecodes, cut the videos to about a common start, or "
+                "leave these cameras out with 'ignore' in capture.toml"
             )
         first = min(start for start, _ in found.values())
         starts = {name: round(start - first, 6) for name, (start, _) in found.items()}
@@ -124,12 +124,25 @@ def find_starts(workshop: Workshop, options: MotionOptions, transfer: Transfer |
     )
 
 
+def _period_ns(own: np.ndarray) -> float:
+    return float(np.median(np.diff(np.sort(own))))
+
+
+def _slow(times: Mapping[str, np.ndarray]) -> str:
+    """Cameras that film too few frames to be compared with most."""
+    periods = {name: _period_ns(own) for name, own in times.items()}
+    usual = float(np.median(list(periods.values())))
+    slow = {name: own for name, own in periods.items() if own > (LONGEST_STEP + 0.5) * usual}
+    films = ", ".join(f"{name} films {1e9 / own:.3g}" for name, own in slow.items())
+    return f"; {films} frames per second, most cameras {1e9 / usual:.3g}, which is too few to compare" if slow else ""
+
+
 def _rows(times: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float]:
     """Frames int [T, C] that would be of one moment had all cameras begun at once, and the seconds between rows."""
     alone = [name for name, own in times.items() if len(own) < 2]
     if alone:
         raise ValueError(f"a camera needs two frames or more to tell when it began, but {', '.join(alone)} has one")
-    period = float(np.median([np.median(np.diff(np.sort(own))) for own in times.values()]))
+    period = float(np.median([_period_ns(own) for own in times.values()]))
     shortest = min(float(own.max()) for own in times.values())
     span = min(shortest, WINDOW_SECONDS * 1e9)
     grid = (shortest - span) / 2 + np.arange(int(span / period) + 1) * period
@@ -139,7 +152,9 @@ def _rows(times: Mapping[str, np.ndarray]) -> tuple[np.ndarray, float]:
         after = np.clip(np.searchsorted(own[order], grid), 1, len(own) - 1)
         before = after - 1
         found = order[np.where(grid - own[order][before] <= own[order][after] - grid, before, after)]
-        columns.append(np.where(np.abs(own[found] - grid) <= period / 2, found, -1))
+        found = np.where(np.abs(own[found] - grid) <= period / 2, found, -1)
+        found[1:][found[1:] == found[:-1]] = -1  # one frame is of one moment
+        columns.append(found)
     return np.stack(columns, axis=1), period / 1e9
 
 

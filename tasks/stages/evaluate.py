@@ -141,12 +141,12 @@ def _max_width(extra: Mapping[str, Any]) -> int | None:
 
 def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
     found = find_capture(capture)
-    infos = probe_capture(found)
     what = "the scene's header: sync"
     reference, tolerance_ns, clock = (field(sync, name, what) for name in ("reference", "tolerance_ns", "clock"))
     if tolerance_ns is not None:
         tolerance_ns = whole(tolerance_ns, f"{what}: tolerance_ns", most=MOST_NS)
     options = AlignOptions(reference=reference, tolerance_ns=tolerance_ns, clock=ClockMode(clock))
+    infos = probe_capture(found, listen=options.clock is not ClockMode.CONTENT)
     timecodes = load_timecodes(found, infos, options.clock)
     if options.clock is ClockMode.CONTENT:  # the starts have what time_offset_s added in them
         starts = fields(field(sync, STARTS_NS, what), f"{what}: {STARTS_NS}")

@@ -9,7 +9,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from sync.align import AlignOptions, FrameGroups, SyncReport, align, build_index, save_index
+from sync.align import AlignOptions, FrameGroups, SyncReport, align, save_index
 from sync.capture import (
     Capture,
     find_capture,
@@ -29,6 +29,8 @@ from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 
+HEARD = ".heard"
+"""Folder in the store for the LTC of long sound tracks"""
 STARTS = "starts.json"
 STARTS_NS = "starts_ns"
 """Key of the same in the header of a scene"""
@@ -41,7 +43,7 @@ FOOTAGE = "footage"
 class Synchronize(Stage):
     """Match the frames of all cameras: sync.json, groups.arrow, videos.json and the AVL index of each camera."""
 
-    name, version = "sync", 5
+    name, version = "sync", 6
     small = True
     videos: Files
     timecodes: Files
@@ -58,7 +60,7 @@ class Synchronize(Stage):
     def build(self, work: Work) -> Notes:
         found = find_capture(work.site.capture)
         self._check(found)
-        infos = probe_capture(found, work.progress)
+        infos = probe_capture(found, work.progress, listen=self.starts is None, kept=work.site.store / HEARD)
         if self.starts is None:
             timecodes = load_timecodes(found, infos, self.options.clock)
         else:
@@ -66,7 +68,7 @@ class Synchronize(Stage):
             timecodes = with_offsets(found, begun(load_durations(found, infos), starts), self.options.clock)
         groups, report = align(timecodes, self.options)
         groups.save(work.out, report)
-        save_index(build_index(timecodes, report.clocks), work.out)
+        save_index(timecodes, report.clocks, work.out)
         videos = {camera: _info_to_json(info) for camera, info in infos.items()}
         rate = found.settings.fps or _nominal_rate(infos, report)
         write_json(work.out / "videos.json", {"rate": rate, "videos": videos})

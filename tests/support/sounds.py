@@ -29,20 +29,23 @@ def recorded(sound: np.ndarray, start_s: float, seed: int, noise: float = 0.02) 
     return own * np.random.default_rng(seed).uniform(0.2, 2) + np.random.default_rng(seed).normal(0, noise, len(own))
 
 
-def write_video(path: Path, samples: np.ndarray | None) -> None:
-    """A grey video of two seconds at 10 frames a second, with sound."""
+def write_video(path: Path, *tracks: np.ndarray | None, rate: int = RATE) -> None:
+    """A grey video of two seconds at 10 frames a second, with sound, float [n] or [channels, n] a track."""
     with av.open(str(path), "w") as container:
         picture = container.add_stream("ffv1", rate=10)
         picture.width, picture.height, picture.pix_fmt = 32, 32, "bgr0"
-        voice = None if samples is None else container.add_stream("pcm_s16le", rate=RATE, layout="mono")
+        sounds = [np.atleast_2d(samples) for samples in tracks if samples is not None]
+        layouts = ["mono" if len(sound) == 1 else "stereo" for sound in sounds]
+        voices = [container.add_stream("pcm_f32le", rate=rate, layout=layout) for layout in layouts]
         for _ in range(20):
             grey = av.VideoFrame.from_ndarray(np.full((32, 32, 3), 90, np.uint8), format="rgb24")
             container.mux(picture.encode(grey))
         container.mux(picture.encode())
-        if voice is not None and samples is not None:
-            whole = (np.clip(samples, -1, 1) * 32767).astype(np.int16)
-            for start in range(0, len(whole), 1000):
-                part = av.AudioFrame.from_ndarray(whole[None, start : start + 1000], format="s16", layout="mono")
-                part.rate, part.pts = RATE, start
+        for sound, voice, layout in zip(sounds, voices, layouts, strict=True):
+            whole = np.ascontiguousarray(sound.T, np.float32).reshape(1, -1)
+            for start in range(0, sound.shape[1], 1000):
+                samples = whole[:, start * len(sound) : (start + 1000) * len(sound)]
+                part = av.AudioFrame.from_ndarray(samples, format="flt", layout=layout)
+                part.rate, part.pts = rate, start
                 container.mux(voice.encode(part))
             container.mux(voice.encode())

@@ -287,7 +287,7 @@ def test_groups_report_and_index_survive_saving(tmp_path: Path, clock: ClockMode
     timecodes, _ = rig(7)
     groups, report = align(timecodes, AlignOptions(clock=clock))
     groups.save(tmp_path, report)
-    save_index(build_index(timecodes, report.clocks), tmp_path)
+    save_index(timecodes, report.clocks, tmp_path)
     loaded = FrameGroups.load(tmp_path)
     assert (loaded.cameras, loaded.reference) == (groups.cameras, groups.reference)
     for name in ("times_ns", "frames", "residuals_ns"):
@@ -307,7 +307,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
         timecodes, _ = rig(7)
         groups, report = align(timecodes, AlignOptions(clock=ClockMode.TRIGGERED))
         groups.save(tmp_path / name, report)
-        save_index(build_index(timecodes, report.clocks), tmp_path / name)
+        save_index(timecodes, report.clocks, tmp_path / name)
     files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*") if path.is_file())
     assert len(files) == 2 + 5
     for file in files:
@@ -366,3 +366,12 @@ def test_groups_check_their_shapes() -> None:
         FrameGroups(("a", "b"), "a", times, np.zeros((3, 1), np.int32), np.zeros((3, 2), np.int64))
     with pytest.raises(ValueError, match="'c' must be one of"):
         FrameGroups(("a",), "c", times, np.zeros((3, 1), np.int32), np.zeros((3, 1), np.int64))
+
+
+def test_a_clock_that_stood_still_is_named():
+    still = Timecodes(np.full(20, 5_000, np.int64), np.arange(20))
+    moving = Timecodes(np.arange(20) * 33_000_000, np.arange(20))
+    with pytest.raises(
+        ValueError, match=r"^b must have a timecode for each frame, but all lines .* 5000 ns: its clock"
+    ):
+        align({"a": moving, "b": still, "c": moving})

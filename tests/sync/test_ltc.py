@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import wave as wav
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sync import ltc
 from sync.capture import find_capture, load_timecodes, probe_capture
-from sync.ltc import DROP_RATE, RATE, RATES, _of_frames, decode_ltc
+from sync.clock import ClockMode
+from sync.ltc import DROP_RATE, RATE, RATES, _Labels, _of_frames, decode_ltc
 from sync.probe import container_timecodes, probe_video
 from sync.timecode import NANOSECONDS, frame_to_label, frames_per_day, labels_to_ns
 from tests.support.ltc import wave
@@ -149,3 +153,174 @@ def test_misread_digits_are_not_believed() -> None:
     times = _of_frames(heard, rate, pts_ns)
     assert np.abs(times.times_ns - labels_to_ns(labels[:1], rate)[0] - pts_ns).max() < 1_000_000
     assert times.jumps == 0
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    rate=st.sampled_from(RATES),
+    louder=st.floats(0, 3),
+    mains=st.sampled_from([50, 60]),
+    phase=st.floats(0, 6),
+    gain=st.floats(0.1, 0.6),
+    rounded=st.integers(1, 8),
+)
+def test_hum_of_mains_is_not_heard(rate, louder, mains, phase, gain, rounded):
+    """Nor where it drives the labels to the ends of the scale, if they are not cut to nothing there."""
+    labels = labels_from(90_000, 60, rate)
+    clean = np.convolve(wave(labels, rate), np.ones(rounded) / rounded, "same")
+    turn = 2 * np.pi * mains * np.arange(len(clean)) / RATE + phase
+    sound = gain * (clean + louder * (np.sin(turn) + 0.2 * np.sin(3 * turn)))
+    most = gain * (0.4 + louder)
+    sound = np.clip(sound, -most, most)
+    heard = decode_ltc(sound.astype(np.float32))
+    assert heard is not None
+    assert len(heard.begins_s) >= 57
+    places = [labels.index("{:02}:{:02}:{:02}:{:02}".format(*row)) for row in heard.fields]
+    assert np.allclose(heard.begins_s, np.array(places) / float(rate), rtol=0, atol=5 * TOLERANCE_S)
+
+
+def test_labels_of_which_most_are_misread_are_no_times() -> None:
+    rate = Fraction(25)
+    fields = np.array([[0, 0, second // 25 * (second % 3), second % 25] for second in range(200)])
+    assert _of_frames(_Labels(np.arange(200) / 25, fields, False), rate, np.arange(200) * 40_000_000) is None
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(st.floats(-2, 2), st.integers(1, 4000)), max_size=60))
+def test_any_sound_is_heard_or_not(parts):
+    sound = np.concatenate([np.full(length, level, np.float32) for level, length in parts] or [np.zeros(0)])
+    assert decode_ltc(sound) is None
+
+
+def tracks(path: Path, sounds: list[np.ndarray], *, codec: str = "pcm_f32le", rate: int = RATE) -> Path:
+    """A video of 3 seconds with a track for each sound, float32 as it is; `rate` is what the header says."""
+    inputs: list[str] = []
+    for number, sound in enumerate(sounds):
+        raw = path.with_suffix(f".{number}.raw")
+        raw.write_bytes(sound.astype("<f4").tobytes())
+        inputs += ["-f", "f32le", "-ar", str(rate), "-ac", "1", "-i", str(raw)]
+    maps = [part for number in range(len(sounds) + 1) for part in ("-map", str(number))]
+    subprocess.run(
+        ["ffmpeg", "-v", "error", "-y", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=30:duration=3", *inputs,
+         *maps, "-c:v", "libx264", "-c:a", codec, path],
+        check=True,
+    )  # fmt: skip
+    return path
+
+
+@needs_ffmpeg
+def test_labels_on_the_second_track_and_numbers_that_are_none(tmp_path: Path) -> None:
+    rate = Fraction(25)
+    labels = wave(labels_from(90_000, 80, rate), rate)[: 3 * RATE]
+    room = np.random.default_rng(1).normal(0, 0.1, 3 * RATE)
+    room[:RATE] = np.nan
+    labels[100:140], labels[200:210] = np.nan, np.inf
+    info = probe_video(tracks(tmp_path / "cam.mov", [room, labels]))
+    assert (info.start_label, info.notes) == ("01:00:00:00", ())
+    assert info.heard_ns is not None
+    assert np.abs(info.heard_ns - 3_600 * NANOSECONDS - info.pts_ns).max() < 300_000
+
+
+@needs_ffmpeg
+def test_labels_that_begin_after_silence_are_heard(tmp_path: Path) -> None:
+    rate = Fraction(25)
+    late = np.concatenate([np.zeros(12 * RATE), wave(labels_from(90_300, 80, rate), rate)])
+    info = probe_video(tracks(tmp_path / "cam.mov", [late]))
+    assert (info.start_label, info.notes) == ("01:00:00:00", ())
+
+
+@needs_ffmpeg
+def test_two_tracks_that_disagree_are_both_told(tmp_path: Path) -> None:
+    rate = Fraction(25)
+    sounds = [wave(labels_from(first, 80, rate), rate)[: 3 * RATE] for first in (90_000, 90_250)]
+    info = probe_video(tracks(tmp_path / "cam.mov", sounds))
+    assert info.start_label == "01:00:00:00"
+    assert info.notes == (
+        "cam: channel 1 of sound track 2 carries LTC, too, which is +10.0 s from that of channel 1 of sound track 1; "
+        "the latter is used",
+    )
+
+
+@needs_ffmpeg
+def test_a_track_whose_header_has_another_rate_is_named(tmp_path: Path) -> None:
+    rate = Fraction(25)
+    sound = wave(labels_from(90_000, 80, rate), rate)
+    info = probe_video(tracks(tmp_path / "cam.mov", [sound], rate=44_100))
+    assert info.start_label is None
+    (note,) = info.notes
+    assert "carries LTC of 22.97 labels a second, which is no rate of labels: is the sample rate" in note
+
+
+@needs_ffmpeg
+def test_labels_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    rate, rng = Fraction(25), np.random.default_rng(5)
+    sound = wave(labels_from(90_000, 80, rate), rate)[: 3 * RATE]
+    digits = np.arange(len(sound)) % 1920 < 1400  # of each label; the sync word is left
+    broken = np.where(digits & (rng.random(len(sound)) < 0.3), rng.uniform(-1, 1, len(sound)), sound)
+    info = probe_video(tracks(tmp_path / "cam.mov", [broken]))
+    assert info.start_label is None
+    assert info.notes == (
+        "cam: channel 1 of sound track 1 carries LTC, but is too distorted to be read; it is not used",
+    )
+
+
+@needs_ffmpeg
+def test_labels_go_on_over_damage(tmp_path: Path) -> None:
+    """What comes after a damaged packet stays where it was."""
+    rate = Fraction(25)
+    path = tracks(tmp_path / "cam.mkv", [0.5 * wave(labels_from(90_000, 80, rate), rate)[: 3 * RATE]], codec="flac")
+    whole = probe_video(path)
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(audio=0) if packet.size]
+        spoilt = [bytes(packet) for packet in packets[10:13]]
+    data = path.read_bytes()
+    for packet in spoilt:
+        assert data.count(packet) == 1
+        data = data.replace(packet, b"\x55" * len(packet))
+    path.write_bytes(data)
+    info = probe_video(path)
+    assert info.start_label == whole.start_label == "01:00:00:00"
+    assert info.heard_ns is not None
+    assert whole.heard_ns is not None
+    assert np.abs(info.heard_ns - whole.heard_ns).max() < 300_000
+    assert info.notes == ("cam: 3 packets of the sound track with LTC are damaged: its labels go on over them",)
+
+
+@needs_ffmpeg
+def test_cameras_without_labels_beside_some_with_are_named(tmp_path: Path) -> None:
+    (tmp_path / "videos").mkdir()
+    rate = Fraction(30)
+    for name in ("a", "b"):
+        film(tmp_path / "videos" / f"{name}.mov", [wave(labels_from(108_000, 90, rate), rate)], codec="pcm_s16le")
+    film(tmp_path / "videos" / "c.mov", [np.zeros(3 * RATE)], codec="pcm_s16le")
+    capture = find_capture(tmp_path)
+    infos = probe_capture(capture)
+    with pytest.raises(ValueError, match=r"^c must have a start label or LTC .*as a, b have.*set clock = 'content'"):
+        load_timecodes(capture, infos)
+    assert set(load_timecodes(capture, infos, ClockMode.CONTENT)) == {"a", "b", "c"}
+    midnight = dict(infos)
+    for name in ("a", "b"):  # labels that begin where the container's times do
+        midnight[name] = replace(infos[name], heard_ns=infos["c"].pts_ns, start_label="00:00:00:00")
+    assert load_timecodes(capture, midnight)["c"].notes == (
+        "it has no start label, as a, b have: its times count from 0",
+    )
+
+
+@needs_ffmpeg
+def test_what_was_heard_is_kept_until_the_file_is_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rate, kept = Fraction(25), tmp_path / "kept"
+    path = tracks(tmp_path / "cam.mov", [wave(labels_from(90_000, 80, rate), rate)[: 3 * RATE]])
+    first = probe_video(path, kept=kept)
+    (place,) = kept.iterdir()
+    with monkeypatch.context() as deaf:
+        deaf.setattr(ltc, "_hear", lambda *_: pytest.fail("it was heard already"))
+        again = probe_video(path, kept=kept)
+    assert (again.start_label, again.label_rate, again.notes) == (first.start_label, first.label_rate, first.notes)
+    assert np.array_equal(again.heard_ns, first.heard_ns)
+    for damage in (b"", b"PK damaged", place.read_bytes()[:100]):
+        place.write_bytes(damage)
+        assert np.array_equal(probe_video(path, kept=kept).heard_ns, first.heard_ns)
+    tracks(tmp_path / "cam.mov", [wave(labels_from(0, 80, rate), rate)[: 3 * RATE]])
+    assert probe_video(path, kept=kept).start_label == "00:00:00:00"
+    probe_video(tracks(tmp_path / "mute.mov", [np.zeros(3 * RATE)]), kept=tmp_path / "none")
+    assert not (tmp_path / "none").exists()

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sync.align import AlignOptions, align
 from sync.capture import find_capture, load_timecodes, offsets_of, timing_notes
@@ -69,6 +71,18 @@ def test_what_capture_toml_says_comes_on_top(tmp_path):
     assert found["01"].notes[-1].startswith("+0.1 s are added to its times, as time_offset_s")
     lacking = timing_notes(capture, dict.fromkeys(CAMERAS, info()), ClockMode.TRUSTED)[1]
     assert lacking == "t_offsets.json has no offset for 00, 02: taken for 0"
+
+
+@given(said=st.decimals(-9, 9, places=11), late=st.decimals(-9, 9, places=11))
+def test_times_move_by_what_the_recipe_says(tmp_path_factory, said, late):
+    """To the nanosecond, also where the two parts have halves of one."""
+    settings = f"time_offset_s = {{ 01 = {said:f} }}"
+    path = capture_of(tmp_path_factory.mktemp("c") / "c", {"01": 0}, settings=settings)
+    (path / T_OFFSETS).write_text(f'{{"01": {late:f}}}')
+    capture = find_capture(path)
+    codes = load_timecodes(capture, dict.fromkeys(CAMERAS, info()))["01"]
+    assert codes.times_ns[0] == int(offsets_of(capture, ClockMode.TRUSTED)["01"] * 10**9)
+    assert offsets_of(capture, ClockMode.TRUSTED)["01"] == said - late
 
 
 @pytest.mark.parametrize("clock", [ClockMode.TRIGGERED, ClockMode.CONTENT])

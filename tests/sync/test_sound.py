@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
+from sync.audio import sound_tracks
 from sync.content import sound as module
 from sync.content.sound import RATE, Sound, hear, loudness, starts_by_sound
+from sync.timecode import frame_to_label
+from tests.support.ltc import wave
 from tests.support.sounds import SECONDS, recorded, room, write_video
 
 
@@ -65,3 +70,47 @@ def test_sound_is_read_from_videos(tmp_path):
     expected = loudness(samples)[: len(sound.level)]
     assert np.corrcoef(sound.level[: len(expected)], expected)[0, 1] > 0.95
     assert hear(tmp_path / "b.mkv") is None
+
+
+def test_timecode_on_a_channel_is_no_sound_of_the_room(tmp_path):
+    """Nor on a track before that of the room; and what is no number is silent."""
+    rate, count = 48_000, 8 * 48_000
+    labels = wave([frame_to_label(90_000 + k, Fraction(25)) for k in range(210)], Fraction(25))[:count]
+    heard = {}
+    for number, start in enumerate((0.5, 1.25, 2.0)):
+        samples = np.repeat(recorded(room(), start, number)[: 8 * RATE], rate // RATE)
+        samples[5000:5400] = np.nan
+        tracks = (
+            [np.stack([samples, labels]), np.stack([labels, samples])][number:] if number < 2 else [labels, samples]
+        )
+        write_video(tmp_path / f"{number}.mkv", tracks[0], *tracks[1:2], rate=rate)
+        sound = hear(tmp_path / f"{number}.mkv")
+        assert sound is not None
+        heard[str(number)] = sound
+    starts = starts_by_sound(heard)
+    assert {name: start for name, (start, _) in starts.items()} == pytest.approx(
+        {"0": 0.0, "1": 0.75, "2": 1.5}, abs=0.005
+    )
+
+
+def test_silent_tracks_are_passed_over(tmp_path):
+    samples = recorded(room(), 0.0, 0)[: 6 * RATE]
+    write_video(tmp_path / "a.mkv", np.zeros(6 * RATE), samples)
+    write_video(tmp_path / "b.mkv", np.zeros(6 * RATE), np.full(6 * RATE, np.nan))
+    level = hear(tmp_path / "a.mkv").level
+    assert np.corrcoef(level, loudness(samples)[: len(level)])[0, 1] > 0.95
+    assert not len(hear(tmp_path / "b.mkv").level)
+
+
+def test_sound_after_damage_stays_where_it_was(tmp_path):
+    samples = recorded(room(), 0.0, 0)[: 6 * RATE]
+    write_video(tmp_path / "a.mkv", samples)
+    whole = hear(tmp_path / "a.mkv")
+    (track,) = sound_tracks(tmp_path / "a.mkv")
+    pieces = list(track._pieces(RATE, mono=True))
+    track._pieces = lambda rate, mono: (piece for number, piece in enumerate(pieces) if not 10 <= number < 14)
+    parts = list(track.blocks(20.0, RATE, mono=True))
+    assert len(parts) == 2
+    start = round(parts[1][0] * RATE)
+    assert np.array_equal(parts[1][1][0], np.concatenate([piece[0] for _, piece in pieces])[start:])
+    assert len(whole.level) == pytest.approx(6000, abs=20)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sync.tree
-from sync.tree import TIME_LIMIT_NS, FrameTree, merge_nearest, write_whole
+from sync.tree import TIME_LIMIT_NS, FrameTree, in_order, merge_nearest, write_whole
 
 TIMES = st.integers(-TIME_LIMIT_NS + 1, TIME_LIMIT_NS - 1) | st.integers(-50, 50)
 
@@ -248,3 +248,21 @@ def test_check_notices_each_kind_of_damage(capsys: pytest.CaptureFixture[str]) -
 def test_docstring_examples_hold() -> None:
     assert doctest.testmod(sync.tree).failed == 0
     assert doctest.testmod(sync.tree).attempted > 5
+
+
+@given(st.lists(st.tuples(st.integers(-50, 50), st.integers(0, 9)), max_size=40))
+def test_frames_in_order_are_those_of_the_index(lines):
+    times, frames = [time for time, _ in lines], [frame for _, frame in lines]
+    expected = FrameTree(times, frames).items()
+    for found, right in zip(in_order(times, frames), expected, strict=True):
+        assert np.array_equal(found, right)
+        assert found.dtype == right.dtype
+
+
+def test_frames_that_are_in_order_are_not_copied():
+    times = np.arange(5, dtype=np.int64)
+    assert np.shares_memory(in_order(times, np.arange(5))[0], times)
+    tree = FrameTree(times, np.arange(5))
+    tree.add([2, 9], [7, 7])
+    tree._check()
+    assert times.tolist() == [0, 1, 2, 3, 4]

@@ -14,6 +14,7 @@ from pipelines.cli import FAILED, OK, WRONG, main
 from pipelines.probe import PROBE
 from tests.pipelines.commands.test_run import CAPTURE, _flat
 from tests.support.golden import SETTINGS
+from tests.support.sounds import write_video
 
 SETS = [part for name, value in _flat(SETTINGS) for part in ("--set", f"{name}={value}")]
 HOW = ["--preset", "draft", "--hold-out", "cam03", *SETS]
@@ -102,3 +103,52 @@ def test_a_folder_of_captures_is_planned_as_a_batch_is(tmp_path, capsys):
 def test_what_cannot_be_planned_is_one_sentence(tmp_path, capsys, source, more, message):
     assert main(["plan", source, "--out", str(tmp_path), *more]) == WRONG
     assert message in capsys.readouterr().err
+
+
+def still(folder: Path) -> Path:
+    """A capture in which nothing moves or sounds."""
+    (folder / "videos").mkdir(parents=True)
+    for name in ("cam1", "cam2", "cam3"):
+        write_video(folder / "videos" / f"{name}.mkv", None)
+    return folder
+
+
+def cut_short(folder: Path) -> Path:
+    """A capture whose last camera has a time too few."""
+    still(folder)
+    (folder / "timecodes").mkdir()
+    for count, name in ((20, "cam1"), (20, "cam2"), (19, "cam3")):
+        lines = [f"frame_{1_700_000_000_000_000 + k * 100_000}_{k:012d}\n" for k in range(count)]
+        (folder / "timecodes" / f"{name}.txt").write_text("".join(lines))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("capture", "more", "message"),
+    [
+        (still, ["--clock", "content"], "do not tell when cam1, cam2, cam3 began to film"),
+        (cut_short, [], "19 timecodes"),
+        (still, ["--frames", "50:60"], "the capture has instants 0 to 19"),
+    ],
+)
+def test_a_plan_refuses_what_its_run_refuses(tmp_path, capsys, capture, more, message):
+    source = str(capture(tmp_path / "take"))
+    told = []
+    for command in (["plan"], ["run", "--direct"]):
+        assert main([command[0], source, "--out", str(tmp_path / "out"), *command[1:], *more]) == WRONG
+        told.append(capsys.readouterr().err.strip().splitlines()[-1])
+        if command[0] == "plan":
+            assert not (tmp_path / "out").exists(), "a plan leaves nothing where nothing was"
+    assert told[0] == told[1]
+    assert message in told[0]
+
+
+def test_a_sequence_that_its_run_would_refuse_does_not_stop_the_plan_of_the_others(tmp_path, capsys):
+    shutil.copytree(CAPTURE, tmp_path / "shoot" / "a")
+    (tmp_path / "shoot" / "a" / "capture.toml").write_text('name = "a"\n')
+    cut_short(tmp_path / "shoot" / "b")
+    how = ["--preset", "draft", *SETS, "--at-once", "1"]
+    assert main(["plan", str(tmp_path / "shoot"), "--out", str(tmp_path / "out"), *how, "--json"]) == OK
+    rows = json.loads(capsys.readouterr().out)["sequences"]
+    assert [(row["sequence"], row["does"]) for row in rows] == [("a", "runs"), ("b", "bad input")]
+    assert "19 timecodes" in rows[1]["why"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -15,7 +16,7 @@ from pipelines.options import compose
 from sync.align import AlignOptions, SyncReport
 from sync.capture import CaptureSettings, find_capture
 from sync.clock import ClockMode
-from sync.content import Content, ContentOptions, find_offsets
+from sync.content import Content, ContentOptions, Offset, Window, find_offsets
 from sync.content.sound import RATE
 from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key
@@ -36,14 +37,16 @@ NAMES = tuple(f"cam{number}" for number in range(COUNT))
 MOTION_OPTIONS = MotionOptions(keep_flow=False, width=WIDTH)
 
 
-def film(folder: Path, late: dict[int, float]) -> None:
-    """A video for each camera, which begins `late` instants after the first; bright balls before a grey ramp."""
+def film(folder: Path, late: dict[int, float], rates: dict[int, Fraction] | None = None) -> None:
+    """A video for each camera, which begins `late` instants after the first; bright balls before a grey ramp. `rates`
+    are those of cameras that do not film 30 frames a second."""
     (folder / "videos").mkdir(parents=True)
     wall = np.linspace(40, 90, WIDTH * HEIGHT).astype(np.uint8)
     for number, name in enumerate(NAMES):
-        times = np.arange(FRAMES) + late.get(number, 0.0)
+        rate = (rates or {}).get(number, Fraction(30))
+        times = np.arange(int(FRAMES * rate / 30)) * float(30 / rate) + late.get(number, 0.0)
         with av.open(str(folder / "videos" / f"{name}.mkv"), "w") as container:
-            stream = container.add_stream("ffv1", rate=30)
+            stream = container.add_stream("ffv1", rate=rate)
             stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "bgr0"
             for seen in covered(number, COUNT, times, WIDTH, HEIGHT):
                 grey = np.where(seen, 230, wall).astype(np.uint8).reshape(HEIGHT, WIDTH)
@@ -152,6 +155,16 @@ def test_what_the_pictures_say_of_times_is_told(tmp_path: Path) -> None:
     assert "time_offset_s = { cam0 = -0.03" in told
 
 
+def test_cameras_that_lie_equally_are_told_to_be_a_group() -> None:
+    offsets = {name: Offset(0.0, 0.1) for name in NAMES} | {name: Offset(3.0, 0.1) for name in NAMES[:2]}
+    content = Content(NAMES, (Window(0, 79, offsets),))
+    texts = [found.text for found in findings(ReportInput("balls", content=content))]
+    (told,) = [text for text in texts if "about the same" in text]
+    assert told.startswith("cam0, cam1 lie by about the same +3 frames, 2 of 5 cameras: pictures tell that two groups")
+    apart = Content(NAMES, (Window(0, 79, offsets | {"cam1": Offset(-2.0, 0.1)}),))
+    assert "about the same" not in " ".join(found.text for found in findings(ReportInput("balls", content=apart)))
+
+
 def test_cameras_without_times_are_synchronized_by_their_pictures(tmp_path: Path) -> None:
     site = Site(tmp_path / "store", tmp_path / "capture", 1)
     late = {0: 6.0, 1: 0.0, 2: 3.4, 3: 11.0, 4: 1.0}
@@ -169,6 +182,32 @@ def test_cameras_without_times_are_synchronized_by_their_pictures(tmp_path: Path
     assert {camera["source"] for camera in report["cameras"]} == {"what the cameras saw or heard"}
     content = read_content(site.path(compared(site, tmp_path / "check", groups)))
     assert not lies_in(content)
+
+
+@pytest.mark.parametrize("rates", [{2: 15}, {2: 15, 0: 60, 4: 24}])
+def test_cameras_of_other_rates_are_synchronized_by_their_pictures(tmp_path: Path, rates: dict[int, int]) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    late = {0: 6.0, 1: 0.0, 2: 3.4, 3: 11.0, 4: 1.0}
+    film(site.capture, late, {number: Fraction(rate) for number, rate in rates.items()})
+    write_calibration(site.capture)
+    found = find_starts(site, tmp_path / "clock", known=True)
+    for name, start_ns in read_starts(site.path(found)).items():
+        assert start_ns * 30 / 1e9 == pytest.approx(late[int(name[-1])], abs=0.3)
+    if len(rates) == 1:  # and what the check sees of the slower camera speaks for these starts
+        groups = synchronized(site, tmp_path / "sync", found)
+        content = read_content(site.path(compared(site, tmp_path / "check", groups)))
+        assert not lies_in(content)
+        assert not content.undecided
+        notes = SyncReport.load(site.path(groups)).notes
+        assert any(note.startswith("cam2: it films a frame each 67 ms, cam") for note in notes), notes
+
+
+def test_a_camera_that_films_too_few_frames_is_named(tmp_path: Path) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    film(site.capture, {}, {3: Fraction(5)})
+    write_calibration(site.capture)
+    with pytest.raises(ValueError, match=r"when cam3 began.*; cam3 films 5 frames per second, most cameras 30"):
+        find_starts(site, tmp_path / "clock", known=True)
 
 
 def find_starts(site: Site, folder: Path, *, known: bool) -> Key:
