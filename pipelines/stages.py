@@ -20,16 +20,16 @@ from pipelines.chain import Chain, Epoch, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
-from sync.capture import check_masks, find_capture, find_masks, find_plate
+from sync.capture import find_capture, find_masks, find_plate
 from sync.clock import ClockMode
-from tasks.artefacts.stage import Stage
+from tasks.artefacts.stage import Files, Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import FindPoints, ImportRig, SolveRig, borrow_rig, find_rig, read_names
 from tasks.stages.clock import find_starts
 from tasks.stages.content import CompareContent
 from tasks.stages.encode import Encode, Verify
-from tasks.stages.evaluate import Evaluate, scored_cameras
+from tasks.stages.evaluate import Evaluate, EvaluateForeground, scored_cameras
 from tasks.stages.fitting import (
     FitBackdrop,
     PatchBackdrop,
@@ -40,11 +40,11 @@ from tasks.stages.fitting import (
 )
 from tasks.stages.footage import PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
-from tasks.stages.masks import CheckMasks
+from tasks.stages.masks import CheckMasks, CheckUnseenMasks, MatchMasks, believed
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.scale import ScaleRig, known_of
-from tasks.stages.synchronize import read_videos, synchronize
+from tasks.stages.synchronize import synchronize
 from tasks.stages.track import (
     RAFT,
     ChooseDatedKeyframes,
@@ -160,12 +160,13 @@ class Sequence:
     def _synchronize(self) -> None:
         capture = find_capture(self.plan.capture)
         find_plate(capture)  # whose absence should not show hours later
-        find_masks(capture)  # likewise
+        masks = find_masks(capture)
         options, starts = self.options, None
         if options.sync.clock is ClockMode.CONTENT:
             starts = self._make(find_starts(self.workshop, options.motion, options.pictures.transfer))
         groups = self._make(synchronize(self.workshop, options.sync, starts))
-        check_masks(capture, read_videos(self.workshop.path(groups)))
+        if masks:
+            self._make(MatchMasks(groups=groups, masks=self.workshop.files(masks, "reading masks")))
         check_space(self.workshop, self.plan, self.options, groups)
         self.synchronized(groups)
 
@@ -237,12 +238,25 @@ class Sequence:
         )
 
     def _check_masks(self, take: Take, motion: Key) -> None:
+        """Compare masks with what moves, which tells whether they are used."""
+        unseen = replace(take, cameras=self.placed.held_out)
+        if masks := self._masks(take):
+            self._make(CheckMasks(take=take, motion=motion, masks=masks))
+        if masks := self._masks(unseen):
+            options = self.options.motion
+            self._make(CheckUnseenMasks(take=unseen, masks=masks, motion_options=options))
+
+    def _masks(self, take: Take) -> Files | None:
+        """Of the take's cameras; None where none has any."""
         found = find_masks(self.workshop.capture)
-        if masks := {name: path for name, path in found.items() if name in take.cameras}:
-            files = self.workshop.files(masks, "reading masks")
-            self._make(CheckMasks(take=take, motion=motion, masks=files))
-        elif found:
-            self.workshop.listener.skipped("masks", f"no fitted camera has any, only {', '.join(found)}")
+        masks = {name: path for name, path in found.items() if name in take.cameras}
+        return self.workshop.files(masks, "reading masks") if masks else None
+
+    def _believed(self, take: Take) -> Files | None:
+        """Masks of those of the take's cameras whose masks fit what moves; None where those of none do."""
+        notes = [self.workshop.store.receipt(key).notes for key in self.made.keys.get("masks", ())]
+        good = {name for part in notes for name in believed(part)}
+        return self._masks(replace(take, cameras=tuple(name for name in take.cameras if name in good)))
 
     def _patches(self, take: Take) -> Key | None:
         """What changes for good; None where nothing does, so that nothing depends on how that was found."""
@@ -336,11 +350,15 @@ class Sequence:
         return self._make(self._evaluation(take))
 
     def _evaluation(self, take: Take) -> Evaluate:
-        """With LPIPS, where the file of weights and the package for it are there."""
+        """With LPIPS, where the file of weights and the package for it are there, and of the foreground, too, where
+        there are masks to believe."""
         scene, named = self.made.only("encode"), self.options.evaluate.lpips_weights
         weights = Path(named).resolve() if named else None
         why = lacking(weights)
         if why or weights is None:
-            return Evaluate(take=take, scene=scene, no_lpips=why)
-        backbone = self.workshop.files({"backbone": weights}, "evaluate")
-        return Evaluate(take=take, scene=scene, backbone=backbone, weights=str(weights))
+            plain = Evaluate(take=take, scene=scene, no_lpips=why)
+        else:
+            backbone = self.workshop.files({"backbone": weights}, "evaluate")
+            plain = Evaluate(take=take, scene=scene, backbone=backbone, weights=str(weights))
+        masks = self._believed(take)
+        return EvaluateForeground(**vars(plain), masks=masks) if masks else plain

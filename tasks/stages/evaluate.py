@@ -13,7 +13,7 @@ import numpy as np
 
 from packuv.bounds import MOST_CAMERAS, MOST_NS, MOST_SIDE_PX, field, fields, items, whole
 from packuv.files import save_json
-from packuv.footage import LensCamera, Light, Transfer, Views
+from packuv.footage import LensCamera, Light, Silhouettes, Transfer, Views
 from packuv.footage.light import unpacked
 from packuv.lpips import Lpips, lacking
 from packuv.progress import Progress
@@ -65,7 +65,8 @@ class Evaluate(Stage):
         views, scene = Footage(self.take, work.site).open_views(), work.path(self.scene) / SCENE
         lpips = Lpips(Path(self.weights)) if self.backbone else None
         with open_scene(scene) as opened:
-            scores = score(opened, views, work.progress, lpips=lpips, workers=work.site.threads, scratch=work.scratch)
+            scores = score(opened, views, work.progress, lpips=lpips, silhouettes=self.silhouettes(work),
+                           workers=work.site.threads, scratch=work.scratch)  # fmt: skip
             write_table(work.out / TABLE, scores)
             write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
             borders = segment_starts(opened)
@@ -74,9 +75,24 @@ class Evaluate(Stage):
         notes = {name: facts[name] for name in ("cameras", "held_out", "mean")}
         return {**notes, "no_lpips": self.no_lpips} if self.no_lpips else notes
 
+    def silhouettes(self, work: Work) -> Silhouettes | None:
+        """What tells the foreground."""
+        return None
+
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         if "no_lpips" in notes:
             yield "LPIPS", notes["no_lpips"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateForeground(Evaluate):
+    """Score the foreground of cameras that have masks, too."""
+
+    masks: Files
+    """By camera"""
+
+    def silhouettes(self, work: Work) -> Silhouettes:
+        return Footage(self.take, work.site).open_silhouettes(self.masks)
 
 
 def scored_cameras(plan: Plan, options: EvaluateOptions) -> tuple[str, ...]:
@@ -180,6 +196,9 @@ def frame_scores(scores: Sequence[Score]) -> tuple[FrameScore, ...]:
             tof_px=item.tof_px,
             flicker=item.flicker,
             lpips=item.lpips,
+            foreground_db=item.psnr_foreground_db,
+            foreground_ssim=item.ssim_foreground,
+            foreground_lpips=item.lpips_foreground,
         )
         for item in scores
     )
