@@ -29,7 +29,7 @@ from tasks.stages.calibrate import FindPoints, ImportRig, SolveRig, borrow_rig, 
 from tasks.stages.clock import find_starts
 from tasks.stages.content import CompareContent
 from tasks.stages.encode import Encode, Verify
-from tasks.stages.evaluate import Evaluate, EvaluateForeground, scored_cameras
+from tasks.stages.evaluate import Evaluate, scored_cameras
 from tasks.stages.fitting import (
     FitBackdrop,
     PatchBackdrop,
@@ -38,7 +38,7 @@ from tasks.stages.fitting import (
     count_pictures,
     lacks_backdrop,
 )
-from tasks.stages.footage import PictureOptions, Take
+from tasks.stages.footage import MaskedTake, PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
 from tasks.stages.masks import CheckMasks, CheckUnseenMasks, MatchMasks, believed
 from tasks.stages.plan import Plan
@@ -252,11 +252,12 @@ class Sequence:
         masks = {name: path for name, path in found.items() if name in take.cameras}
         return self.workshop.files(masks, "reading masks") if masks else None
 
-    def _believed(self, take: Take) -> Files | None:
-        """Masks of those of the take's cameras whose masks fit what moves; None where those of none do."""
+    def _masked(self, take: Take) -> Take:
+        """The take with masks of those of its cameras whose masks fit what moves; the same where those of none do."""
         notes = [self.workshop.store.receipt(key).notes for key in self.made.keys.get("masks", ())]
         good = {name for part in notes for name in believed(part)}
-        return self._masks(replace(take, cameras=tuple(name for name in take.cameras if name in good)))
+        masks = self._masks(replace(take, cameras=tuple(name for name in take.cameras if name in good)))
+        return MaskedTake(**vars(take), masks=masks) if masks else take
 
     def _patches(self, take: Take) -> Key | None:
         """What changes for good; None where nothing does, so that nothing depends on how that was found."""
@@ -285,14 +286,15 @@ class Sequence:
         take = self._take("points")
         told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
         parts, motion = self._epochs(take, told, spans), self.made.only("motion")
-        return Chain(self.workshop, self.placed, self.options, self.submit, told, parts, motion)
+        masked = self._masked(told)
+        return Chain(self.workshop, self.placed, self.options, self.submit, told, masked, parts, motion)
 
     def _background(self, take: Take) -> Key | None:
         options = self.options.fit.background
         if not options.instants:
             self.workshop.listener.skipped("background", "fit.background.instants is 0")
             return None
-        return self._make(background_of(self.workshop, take, options))
+        return self._make(background_of(self.workshop, self._masked(take), options))
 
     def _epochs(self, take: Take, told: Take, spans: list[range]) -> list[Epoch]:
         """The times between the dates at which something changes for good, each with what stands still in it."""
@@ -305,7 +307,7 @@ class Sequence:
             return [Epoch(0, background, self._make(first))]
         times = epochs(read_patches(self.workshop.path(dated)).dates, spans[-1].stop)
         under_way = [
-            self.submit(PatchBackground(take=take, background=background, patches=dated, epoch=number,
+            self.submit(PatchBackground(take=self._masked(take), background=background, patches=dated, epoch=number,
                                         options=fit.background)) for number in range(len(times))
         ]  # fmt: skip
         stills = [self.made.add(future.result()) for future in under_way]
@@ -347,18 +349,14 @@ class Sequence:
     def score(self, cameras: tuple[str, ...], pictures: PictureOptions) -> Key:
         """Scores of the scene on these cameras, against pictures of this size; noted in `made`, as in a run."""
         take = replace(self._take("points"), cameras=cameras, pictures=pictures, stop=None)
-        return self._make(self._evaluation(take))
+        return self._make(self._evaluation(self._masked(take)))
 
     def _evaluation(self, take: Take) -> Evaluate:
-        """With LPIPS, where the file of weights and the package for it are there, and of the foreground, too, where
-        there are masks to believe."""
+        """With LPIPS, where the file of weights and the package for it are there."""
         scene, named = self.made.only("encode"), self.options.evaluate.lpips_weights
         weights = Path(named).resolve() if named else None
         why = lacking(weights)
         if why or weights is None:
-            plain = Evaluate(take=take, scene=scene, no_lpips=why)
-        else:
-            backbone = self.workshop.files({"backbone": weights}, "evaluate")
-            plain = Evaluate(take=take, scene=scene, backbone=backbone, weights=str(weights))
-        masks = self._believed(take)
-        return EvaluateForeground(**vars(plain), masks=masks) if masks else plain
+            return Evaluate(take=take, scene=scene, no_lpips=why)
+        backbone = self.workshop.files({"backbone": weights}, "evaluate")
+        return Evaluate(take=take, scene=scene, backbone=backbone, weights=str(weights))

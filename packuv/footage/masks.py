@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 
 import cv2
@@ -67,15 +67,10 @@ def foreground(pixels: np.ndarray) -> np.ndarray:
 class Silhouettes:
     """Where the foreground is in the pictures of some cameras, which are known by name."""
 
-    def __init__(self, masks: Views) -> None:
-        """`masks` are laid over the pictures, instant by instant."""
+    def __init__(self, masks: Views, *, but: Container[str] = ()) -> None:
+        """`masks` are laid over the pictures, instant by instant; those of some cameras may be left out."""
         self._masks = masks
-        self._places = {name: place for place, name in enumerate(masks.names)}
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Cameras that have masks."""
-        return self._masks.names
+        self._places = {name: place for place, name in enumerate(masks.names) if name not in but}
 
     def of(self, camera: str, instant: int) -> np.ndarray | None:
         """bool [H, W] of a picture; None where there is no mask of it."""

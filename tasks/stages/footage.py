@@ -84,6 +84,14 @@ class Take:
     pictures: PictureOptions = PictureOptions()
 
 
+@dataclass(frozen=True, kw_only=True)
+class MaskedTake(Take):
+    """A take of which masks tell the foreground."""
+
+    masks: Files
+    """By camera; those of other cameras do not matter"""
+
+
 @dataclass(frozen=True)
 class Footage:
     """A take where a job finds it."""
@@ -167,9 +175,9 @@ class Footage:
         pictures = self.take.pictures
         return Views(videos, frames, lenses, max_width=pictures.max_width, transfer=pictures.transfer, reader=reader)
 
-    def open_silhouettes(self, masks: Files) -> Silhouettes:
-        """The foreground by `open_masks`."""
-        return Silhouettes(self.open_masks(masks))
+    def open_silhouettes(self) -> Silhouettes | None:
+        """The foreground of the take, if masks tell it."""
+        return Silhouettes(self.open_masks(self.take.masks)) if isinstance(self.take, MaskedTake) else None
 
     def open_masks(self, files: Files) -> Views:
         """Foreground masks of those of this take's cameras that have some among the files, laid over the pictures that
