@@ -207,8 +207,8 @@ def fit_next(
 
     Only what differs from there may change: Gaussians that no difference touches keep every code, and those of the
     backdrop keep it in any case. What stood before the background and has gone is dropped, and new Gaussians are born
-    in the hull of what stands there now, as `silhouettes` of the cameras that have some tell; `stills` may be empty,
-    then nothing else is known to have gone. What exceeds the
+    in the hull of what stands there now; `stills` may be empty, then nothing is known to have gone. `silhouettes` of
+    some cameras say what stands there: half of the new ones are born in their hull. What exceeds the
     cap makes room: of the Gaussians that may change, those that show least.
     """
     started = time.monotonic()
@@ -233,8 +233,11 @@ def fit_next(
         solver.keep(~gone | inside(model.gaussians, views, ahead, bounds, options))
     solver.free(moving_rows(model.gaussians, quantizer, views, masks, bounds, options))
     solver.make_room(shots)
-    seen = Each(lambda index: masks[index] if ahead[index] is None else ahead[index], len(masks))
-    solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
+    foregrounds = [ahead] if ahead is standing else [ahead, standing]  # shadows need Gaussians, too
+    part = replace(options, key_births=options.key_births // len(foregrounds))
+    for foreground in foregrounds:
+        seen = _first_known(foreground, masks)
+        solver.append(_hull_gaussians(views, instant, seen, bounds, part, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
     if not solver.rows.any():  # nothing that enough cameras see
         figures = figures_of(started, {}, solver) | _unjudged(previous)
@@ -316,7 +319,16 @@ def _ahead(
     if silhouettes is None:
         return standing
     masks = as_bits(silhouettes.of(name, instant) for name in views.names)
-    return Each(lambda camera: standing[camera] if masks[camera] is None else masks[camera], len(masks))
+    if all(mask is None for mask in masks):
+        return standing
+    return _first_known(masks, standing)
+
+
+def _first_known(
+    masks: Sequence[np.ndarray | None], others: Sequence[np.ndarray | None]
+) -> Sequence[np.ndarray | None]:
+    """The masks, and the others where there is none; one at a time in memory."""
+    return Each(lambda index: others[index] if masks[index] is None else masks[index], len(masks))
 
 
 def _either(first: Sequence[np.ndarray | None], second: Sequence[np.ndarray | None]) -> Sequence[np.ndarray | None]:
