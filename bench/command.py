@@ -19,6 +19,7 @@ BENCHMARKS = (
     "front_end",
     "kills",
     "long",
+    "masks",
     "mishaps",
     "motion",
     "pareto",

@@ -25,6 +25,23 @@ def psnr(picture: np.ndarray, truth: np.ndarray) -> float:
     return decibels(float(np.mean((_clipped(picture) - _clipped(truth)) ** 2)))
 
 
+def cut_out(picture: np.ndarray, mask: np.ndarray, *, least_px: int = _WINDOW) -> np.ndarray:
+    """The box around what a mask, bool [H, W], covers of a picture [3, H, W], with black everywhere else.
+
+    The box has sides of at least `least_px`, as far as the picture has. The mask must not be empty.
+    """
+    rows, columns = (_around(np.flatnonzero(mask.any(axis=axis)), mask.shape[1 - axis], least_px) for axis in (1, 0))
+    return np.asarray(picture[:, rows, columns] * mask[rows, columns])
+
+
+def _around(places: np.ndarray, size: int, least: int) -> slice:
+    """From the first to the last of the places, or around them, within `size`."""
+    first, stop = int(places[0]), int(places[-1]) + 1
+    length = min(size, max(least, stop - first))
+    first = min(max(0, (first + stop - length) // 2), size - length)
+    return slice(first, first + length)
+
+
 def decibels(squared_error: float) -> float:
     """PSNR, dB, of a mean squared error of values in [0, 1]; infinite for 0."""
     return float("inf") if squared_error == 0 else -10.0 * float(np.log10(squared_error))

@@ -1,5 +1,5 @@
 """How good pictures of a scene are beside what cameras filmed: PSNR and SSIM, what a common gain explains, moving and
-still areas apart, motion, flicker, LPIPS. docs/scores.md defines each.
+still areas apart, the foreground where masks tell it, motion, flicker, LPIPS. docs/scores.md defines each.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import pyarrow as pa
 from packuv.camera import PinholeCamera
 from packuv.colour import GAMMA, OFFSET, linear_from_srgb, lit, srgb_from_linear
 from packuv.files import open_npz, save_json, save_npz, whole_file
-from packuv.footage import Views
+from packuv.footage import Silhouettes, Views
 from packuv.footage.planes import as_planes
 from packuv.gaussians.floats import Gaussians
-from packuv.metrics import decibels, likenesses, trend
+from packuv.metrics import cut_out, decibels, likenesses, ssim, trend
 from packuv.motion import Follower, one_opencv_thread
 from packuv.progress import Progress
 from packuv.raster import Arena, RasterOptions, render
@@ -66,11 +66,24 @@ class Score:
     psnr_never_moving_db: float | None = None
     """Of the calibrated render, in blocks of a fortieth of the picture's width through which nothing moves in any
     scored frame"""
+    foreground_share: float | None = None
+    """Of the picture, what its mask covers; None without a mask, or with an empty one"""
+    psnr_foreground_db: float | None = None
+    """Of the calibrated render, there"""
+    ssim_foreground: float | None = None
+    """Of the calibrated render, in the box around the mask, with black outside the mask in render and truth"""
+    lpips_foreground: float | None = None
+    """Likewise; None also where no backbone weights were given"""
 
 
-SCHEMA = pa.schema(list(column_types(Score).items()))
+COLUMNS = pa.schema(list(column_types(Score).items()))
+FOREGROUND = ("foreground_share", "psnr_foreground_db", "ssim_foreground", "lpips_foreground")
+"""Fields that masks give; a table without any has no such columns"""
+SCHEMA = pa.schema([column for column in COLUMNS if column.name not in FOREGROUND])
 FIGURES = tuple(column.name for column in SCHEMA if column.type == pa.float64())
-"""Fields of which means say something"""
+"""Fields of which means say something, beside those of the foreground"""
+LEAST_PERCEIVED_PX = 64
+"""Side of the least box whose LPIPS is measured: a network's last layer has some places left then"""
 TRENDS = {"still_trend_db": "psnr_still_db", "never_moving_trend_db": "psnr_never_moving_db"}
 """What is said of their course, dB per 100 frames"""
 BLOCKS = 40
@@ -90,12 +103,14 @@ def score(
     progress: Progress,
     *,
     lpips: Measure | None = None,
+    silhouettes: Silhouettes | None = None,
     workers: int = 2,
     scratch: Path | None = None,
 ) -> list[Score]:
     """Score every frame on all cameras of the views, whose instant i is frame i of the scene.
 
-    A camera without a picture at an instant is not scored there. One thread draws, `workers` others compare; the scores
+    A camera without a picture at an instant is not scored there. `silhouettes` of some cameras have their foreground
+    scored, too. One thread draws, `workers` others compare; the scores
     do not depend on their number. What is scored goes to the folder `scratch`, from which the same scoring goes on
     after a kill; None: to one that goes away.
     """
@@ -104,7 +119,7 @@ def score(
         parts = [_Part(folder, range(len(scene))[first : first + PART]) for first in range(0, len(scene), PART)]
         stack.enter_context(one_opencv_thread())
         pool = stack.enter_context(ThreadPoolExecutor(workers))
-        scorer = _Scorer(scene, views, lpips, pool, AHEAD * workers)
+        scorer = _Scorer(scene, views, lpips, silhouettes, pool, AHEAD * workers)
         for part in parts:
             if part.there:
                 scorer.pass_over(part.frames, part.scores(), progress)
@@ -118,11 +133,19 @@ class _Scorer:
     """Scores frames in order, from any one on."""
 
     def __init__(
-        self, scene: Scene, views: Views, lpips: Measure | None, pool: ThreadPoolExecutor, most_waiting: int
+        self,
+        scene: Scene,
+        views: Views,
+        lpips: Measure | None,
+        silhouettes: Silhouettes | None,
+        pool: ThreadPoolExecutor,
+        most_waiting: int,
     ) -> None:
         self._scene, self._views, self._pool, self._most_waiting = scene, views, pool, most_waiting
         held_out = scene.header.held_out
-        self.judges = [_Judge(views, index, name in held_out, lpips) for index, name in enumerate(views.names)]
+        self.judges = [
+            _Judge(views, index, name in held_out, lpips, silhouettes) for index, name in enumerate(views.names)
+        ]
         self._artist = Artist(scene)
         self._gaussians, self._shown = scene.gaussians(0), 0  # what was read last
         self._at = 0
@@ -269,9 +292,12 @@ class _Shot:
 class _Judge:
     """Compares one camera's pictures with what it filmed, in order, in other threads."""
 
-    def __init__(self, views: Views, camera: int, held_out: bool, lpips: Measure | None) -> None:
+    def __init__(
+        self, views: Views, camera: int, held_out: bool, lpips: Measure | None, silhouettes: Silhouettes | None
+    ) -> None:
         self.name, self.watch = views.names[camera], _Watch()
         self._views, self._camera, self._held_out, self._lpips = views, camera, held_out, lpips
+        self._silhouettes = silhouettes
         self._error: np.ndarray | None = None
         self._last: Future[Score] | None = None
 
@@ -288,18 +314,41 @@ class _Judge:
         )
         perceived = self._lpips(shot.shown, truth) if self._lpips else None
         error = shot.shown - truth
+        ahead = self._foreground(shot, error)
         if before:
             before.result()  # a pool begins in order, so this one has begun
         flicker = None if self._error is None else float(np.abs(error - self._error).mean())
         self._error = error
         areas = self.watch.see(filmed, shot.steady, error)
         return Score(
-            shot.frame, shot.time_ns, self.name, self._held_out, *raw, *calibrated, *own, flicker, *areas, perceived
+            shot.frame,
+            shot.time_ns,
+            self.name,
+            self._held_out,
+            *raw,
+            *calibrated,
+            *own,
+            flicker,
+            *areas,
+            perceived,
+            None,  # until all frames are scored
+            *ahead,
         )
+
+    def _foreground(self, shot: _Shot, error: np.ndarray) -> Areas:
+        """What `FOREGROUND` names; None where no mask tells."""
+        mask = self._silhouettes.of(self.name, shot.frame) if self._silhouettes else None
+        if mask is None or not mask.any():
+            return None, None, None, None
+        alike = ssim(cut_out(shot.shown, mask), cut_out(shot.truth, mask))
+        pair = (cut_out(picture, mask, least_px=LEAST_PERCEIVED_PX) for picture in (shot.shown, shot.truth))
+        perceived = self._lpips(*pair) if self._lpips else None
+        level = _level(np.square(error[:, mask]))
+        return float(mask.mean()), level, alike, perceived
 
 
 Areas = tuple[float | None, float | None, float | None, float | None]
-"""PSNR of what moves and of what is still, dB, share of the picture that moves, tOF in pixels"""
+"""PSNR of what moves and of what is still, dB, share of the picture that moves, tOF in pixels; or `FOREGROUND`"""
 
 
 @dataclass
@@ -405,8 +454,9 @@ def as_pixels(picture: np.ndarray) -> np.ndarray:
 
 def write_table(path: Path, scores: Sequence[Score]) -> None:
     """One row per frame and camera."""
-    table = pa.Table.from_pylist([vars(item) for item in scores], schema=SCHEMA)
-    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_file(file, SCHEMA) as writer:
+    schema = COLUMNS if _know_foreground(scores) else SCHEMA
+    table = pa.Table.from_pylist([vars(item) for item in scores], schema=schema)
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_file(file, schema) as writer:
         writer.write_table(table)
 
 
@@ -423,13 +473,14 @@ def summary(scores: Sequence[Score], *, frames: int, size_bytes: int, borders: S
     Trends are in dB per 100 frames; that of all cameras is the mean of theirs.
     """
     names = list(dict.fromkeys(item.camera for item in scores))
-    by_camera = {name: _facts([item for item in scores if item.camera == name]) for name in names}
+    figures = FIGURES + FOREGROUND * _know_foreground(scores)
+    by_camera = {name: _facts([item for item in scores if item.camera == name], figures) for name in names}
     trends = {name: _mean([facts[name] for facts in by_camera.values()]) for name in TRENDS}
     return {
         "frames": frames,
         "cameras": names,
         "held_out": all(item.held_out for item in scores),
-        "mean": _means(scores) | trends,
+        "mean": _means(scores, figures) | trends,
         "by_camera": by_camera,
         "seam": _seam(scores, set(borders)),
         "bytes": size_bytes,
@@ -444,9 +495,13 @@ def _seam(scores: Sequence[Score], borders: set[int]) -> float | None:
     return at_border / inside if at_border is not None and inside else None
 
 
-def _facts(scores: Sequence[Score]) -> dict[str, float | None]:
+def _know_foreground(scores: Sequence[Score]) -> bool:
+    return any(item.foreground_share is not None for item in scores)
+
+
+def _facts(scores: Sequence[Score], figures: Sequence[str]) -> dict[str, float | None]:
     """Of one camera: means, and trends."""
-    return _means(scores) | {name: _trend(scores, level) for name, level in TRENDS.items()}
+    return _means(scores, figures) | {name: _trend(scores, level) for name, level in TRENDS.items()}
 
 
 def _trend(scores: Sequence[Score], name: str) -> float | None:
@@ -454,8 +509,8 @@ def _trend(scores: Sequence[Score], name: str) -> float | None:
     return trend([frame for frame, _ in known], [level for _, level in known])
 
 
-def _means(scores: Sequence[Score]) -> dict[str, float | None]:
-    return {name: _mean([getattr(item, name) for item in scores]) for name in FIGURES}
+def _means(scores: Sequence[Score], figures: Sequence[str]) -> dict[str, float | None]:
+    return {name: _mean([getattr(item, name) for item in scores]) for name in figures}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -72,6 +72,8 @@ class Chain:
     options: SequenceOptions
     submit: Submit
     take: Take
+    masked: Take
+    """The same, with the foreground where masks tell it"""
     epochs: Sequence[Epoch]
     """Ascending, the first from instant 0 on; mostly the only one. No segment lies in two"""
     motion: Key
@@ -171,7 +173,7 @@ class Chain:
     def _next(self, key: Key, instant: int, end: Key | None = None) -> Future:
         return self.submit(
             FitNext(
-                take=self.take,
+                take=self.masked,
                 background=self._epoch(instant).background,
                 previous=key,
                 end=end,

@@ -315,7 +315,7 @@ def collect(run: Remains) -> ReportInput:
 
 
 GROUPS = {
-    **dict.fromkeys(("clock", "sync"), "sync"),
+    **dict.fromkeys(("clock", "sync", "mask_files"), "sync"),
     **dict.fromkeys(("rig", "light", "points"), "calibrate"),
     **dict.fromkeys(("motion", "content", "masks", "patches", "keyframes"), "flow"),
     **dict.fromkeys(("background", "backdrop", "key", "segment", "preview"), "fit"),
@@ -411,8 +411,8 @@ def _content(folder: Path | None) -> Content | None:
 
 
 def _mask_doubts(run: Remains) -> dict[str, str]:
-    masks = run.made.get("masks")
-    return doubts(run.store.receipt(masks).notes) if masks else {}
+    notes = [run.store.receipt(key).notes for key in run.made.keys.get("masks", ())]
+    return {name: why for part in notes for name, why in doubts(part).items()}
 
 
 def _points_notes(run: Remains) -> Mapping[str, Any]:

@@ -20,9 +20,9 @@ from pipelines.chain import Chain, Epoch, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
-from sync.capture import check_masks, find_capture, find_masks, find_plate
+from sync.capture import find_capture, find_masks, find_plate
 from sync.clock import ClockMode
-from tasks.artefacts.stage import Stage
+from tasks.artefacts.stage import Files, Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import FindPoints, ImportRig, SolveRig, borrow_rig, find_rig, read_names
@@ -38,13 +38,13 @@ from tasks.stages.fitting import (
     count_pictures,
     lacks_backdrop,
 )
-from tasks.stages.footage import PictureOptions, Take
+from tasks.stages.footage import MaskedTake, PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
-from tasks.stages.masks import CheckMasks
+from tasks.stages.masks import CheckMasks, CheckUnseenMasks, MatchMasks, believed
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.scale import ScaleRig, known_of
-from tasks.stages.synchronize import read_videos, synchronize
+from tasks.stages.synchronize import synchronize
 from tasks.stages.track import (
     RAFT,
     ChooseDatedKeyframes,
@@ -161,12 +161,13 @@ class Sequence:
         """Which frames belong together; raises ValueError or FileNotFoundError for what a run refuses until then."""
         capture = find_capture(self.plan.capture)
         find_plate(capture)  # whose absence should not show hours later
-        find_masks(capture)  # likewise
+        masks = find_masks(capture)
         options, starts = self.options, None
         if options.sync.clock is ClockMode.CONTENT:
             starts = self._make(find_starts(self.workshop, options.motion, options.pictures.transfer))
         groups = self._make(synchronize(self.workshop, options.sync, starts))
-        check_masks(capture, read_videos(self.workshop.path(groups)))
+        if masks:
+            self._make(MatchMasks(groups=groups, masks=self.workshop.files(masks, "reading masks")))
         return groups
 
     def _synchronize(self) -> None:
@@ -242,12 +243,26 @@ class Sequence:
         )
 
     def _check_masks(self, take: Take, motion: Key) -> None:
+        """Compare masks with what moves, which tells whether they are used."""
+        unseen = replace(take, cameras=self.placed.held_out)
+        if masks := self._masks(take):
+            self._make(CheckMasks(take=take, motion=motion, masks=masks))
+        if masks := self._masks(unseen):
+            options = self.options.motion
+            self._make(CheckUnseenMasks(take=unseen, masks=masks, motion_options=options))
+
+    def _masks(self, take: Take) -> Files | None:
+        """Of the take's cameras; None where none has any."""
         found = find_masks(self.workshop.capture)
-        if masks := {name: path for name, path in found.items() if name in take.cameras}:
-            files = self.workshop.files(masks, "reading masks")
-            self._make(CheckMasks(take=take, motion=motion, masks=files))
-        elif found:
-            self.workshop.listener.skipped("masks", f"no fitted camera has any, only {', '.join(found)}")
+        masks = {name: path for name, path in found.items() if name in take.cameras}
+        return self.workshop.files(masks, "reading masks") if masks else None
+
+    def _masked(self, take: Take) -> Take:
+        """The take with masks of those of its cameras whose masks fit what moves; the same where those of none do."""
+        notes = [self.workshop.store.receipt(key).notes for key in self.made.keys.get("masks", ())]
+        good = {name for part in notes for name in believed(part)}
+        masks = self._masks(replace(take, cameras=tuple(name for name in take.cameras if name in good)))
+        return MaskedTake(**vars(take), masks=masks) if masks else take
 
     def _patches(self, take: Take) -> Key | None:
         """What changes for good; None where nothing does, so that nothing depends on how that was found."""
@@ -276,14 +291,15 @@ class Sequence:
         take = self._take("points")
         told = replace(take, stop=None)  # a fit is told its instants, whatever comes after them
         parts, motion = self._epochs(take, told, spans), self.made.only("motion")
-        return Chain(self.workshop, self.placed, self.options, self.submit, told, parts, motion)
+        masked = self._masked(told)
+        return Chain(self.workshop, self.placed, self.options, self.submit, told, masked, parts, motion)
 
     def _background(self, take: Take) -> Key | None:
         options = self.options.fit.background
         if not options.instants:
             self.workshop.listener.skipped("background", "fit.background.instants is 0")
             return None
-        return self._make(background_of(self.workshop, take, options))
+        return self._make(background_of(self.workshop, self._masked(take), options))
 
     def _epochs(self, take: Take, told: Take, spans: list[range]) -> list[Epoch]:
         """The times between the dates at which something changes for good, each with what stands still in it."""
@@ -296,7 +312,7 @@ class Sequence:
             return [Epoch(0, background, self._make(first))]
         times = epochs(read_patches(self.workshop.path(dated)).dates, spans[-1].stop)
         under_way = [
-            self.submit(PatchBackground(take=take, background=background, patches=dated, epoch=number,
+            self.submit(PatchBackground(take=self._masked(take), background=background, patches=dated, epoch=number,
                                         options=fit.background)) for number in range(len(times))
         ]  # fmt: skip
         stills = [self.made.add(future.result()) for future in under_way]
@@ -338,7 +354,7 @@ class Sequence:
     def score(self, cameras: tuple[str, ...], pictures: PictureOptions) -> Key:
         """Scores of the scene on these cameras, against pictures of this size; noted in `made`, as in a run."""
         take = replace(self._take("points"), cameras=cameras, pictures=pictures, stop=None)
-        return self._make(self._evaluation(take))
+        return self._make(self._evaluation(self._masked(take)))
 
     def _evaluation(self, take: Take) -> Evaluate:
         """With LPIPS, where the file of weights and the package for it are there."""

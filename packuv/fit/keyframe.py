@@ -37,7 +37,7 @@ from packuv.fit.start.first import AIR_OPACITY, first_gaussians, neighbour_dista
 from packuv.fit.start.hull import hull_points, in_hull
 from packuv.fit.start.points import Points, drawn, no_points, together
 from packuv.fit.start.shell import Shell, sweep_shell
-from packuv.footage import Views, as_planes
+from packuv.footage import Silhouettes, Views, as_planes
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Quantizer, attribute_values
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, rows_of, with_canonical_axes
 from packuv.motion import Still
@@ -198,6 +198,7 @@ def fit_next(
     instant: int,
     *,
     stills: Sequence[Still],
+    silhouettes: Silhouettes | None = None,
     motion: MotionOptions,
     options: NextOptions,
     progress: Progress = no_progress,
@@ -206,7 +207,8 @@ def fit_next(
 
     Only what differs from there may change: Gaussians that no difference touches keep every code, and those of the
     backdrop keep it in any case. What stood before the background and has gone is dropped, and new Gaussians are born
-    in the hull of what stands there now; `stills` may be empty, then nothing is known to have gone. What exceeds the
+    in the hull of what stands there now; `stills` may be empty, then nothing is known to have gone. `silhouettes` of
+    some cameras say what stands there: half of the new ones are born in their hull. What exceeds the
     cap makes room: of the Gaussians that may change, those that show least.
     """
     started = time.monotonic()
@@ -217,19 +219,25 @@ def fit_next(
     model = Model(previous.foreground)
     solver = Solver(model, bounds, options, rng, previous.open_backdrop(options.device, views.budget))
     solver.fix(quantizer)
-    standing = _standing(views, instant, stills, motion)
-    masks = standing if previous.instant is None else _changes(views, previous.instant, instant, motion)
+    standing = unlike_background(views, instant, stills, motion)
+    ahead = _ahead(views, instant, standing, silhouettes)
+    masks = _either(standing, ahead) if previous.instant is None else _changes(views, previous.instant, instant, motion)
     shots = find_shots(views, instant, masks)
     if not shots:
         return replace(previous, instant=instant, figures=figures_of(started, {}, solver) | _unjudged(previous))
     if previous.instant is not None:
-        before = _standing(views, previous.instant, stills, motion)
+        before = _ahead(
+            views, previous.instant, unlike_background(views, previous.instant, stills, motion), silhouettes
+        )
         gone = inside(model.gaussians, views, before, bounds, options)
-        solver.keep(~gone | inside(model.gaussians, views, standing, bounds, options))
+        solver.keep(~gone | inside(model.gaussians, views, ahead, bounds, options))
     solver.free(moving_rows(model.gaussians, quantizer, views, masks, bounds, options))
     solver.make_room(shots)
-    seen = Each(lambda index: masks[index] if standing[index] is None else standing[index], len(masks))
-    solver.append(_hull_gaussians(views, instant, seen, bounds, options, rng, quantizer.sh_degree))
+    foregrounds = [ahead] if ahead is standing else [ahead, standing]  # shadows need Gaussians, too
+    part = replace(options, key_births=options.key_births // len(foregrounds))
+    for foreground in foregrounds:
+        seen = _first_known(foreground, masks)
+        solver.append(_hull_gaussians(views, instant, seen, bounds, part, rng, quantizer.sh_degree))
     shots = tiled(shots, masks, solver, views)
     if not solver.rows.any():  # nothing that enough cameras see
         figures = figures_of(started, {}, solver) | _unjudged(previous)
@@ -286,7 +294,7 @@ def undone(shot: Shot) -> np.ndarray:
     return shot.response.undone(shot.target)
 
 
-def _standing(
+def unlike_background(
     views: Views, instant: int, stills: Sequence[Still], motion: MotionOptions
 ) -> Sequence[np.ndarray | None]:
     """Where each camera's picture shows what its background lacks, or nobody knows that, bool [H, W]; None without
@@ -301,6 +309,38 @@ def _standing(
         return np.asarray(difference(still.pixels, pixels, motion) | ~still.known)
 
     return as_bits(mask(camera) for camera in range(len(views.cameras)))
+
+
+def _ahead(
+    views: Views, instant: int, standing: Sequence[np.ndarray | None], silhouettes: Silhouettes | None
+) -> Sequence[np.ndarray | None]:
+    """What stands before the background, bool [H, W] by camera: what a mask says, and `standing` without one. Both
+    together would have shadows and noise stand there, too."""
+    if silhouettes is None:
+        return standing
+    masks = as_bits(silhouettes.of(name, instant) for name in views.names)
+    if all(mask is None for mask in masks):
+        return standing
+    return _first_known(masks, standing)
+
+
+def _first_known(
+    masks: Sequence[np.ndarray | None], others: Sequence[np.ndarray | None]
+) -> Sequence[np.ndarray | None]:
+    """The masks, and the others where there is none; one at a time in memory."""
+    return Each(lambda index: others[index] if masks[index] is None else masks[index], len(masks))
+
+
+def _either(first: Sequence[np.ndarray | None], second: Sequence[np.ndarray | None]) -> Sequence[np.ndarray | None]:
+    """What one of two masks has, or both, by camera."""
+    if first is second:
+        return first
+
+    def one(index: int) -> np.ndarray | None:
+        known = [mask for mask in (first[index], second[index]) if mask is not None]
+        return np.asarray(np.logical_or.reduce(known)) if known else None
+
+    return Each(one, len(first))
 
 
 def inside(

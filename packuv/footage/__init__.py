@@ -3,7 +3,7 @@
 from packuv.footage.damage import DamageLog, damage_told, without
 from packuv.footage.lens import LensCamera
 from packuv.footage.light import Light, LightOptions, measure_light
-from packuv.footage.masks import MaskReader, foreground
+from packuv.footage.masks import MaskReader, Silhouettes, foreground
 from packuv.footage.planes import as_planes
 from packuv.footage.reader import FrameReader
 from packuv.footage.response import Response
@@ -20,6 +20,7 @@ __all__ = [
     "LightOptions",
     "MaskReader",
     "Response",
+    "Silhouettes",
     "Transfer",
     "Views",
     "WatchingReader",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 
 import cv2
@@ -10,6 +10,7 @@ import numpy as np
 
 from packuv.footage.pictures import picture_names
 from packuv.footage.reader import FrameReader
+from packuv.footage.views import Views
 
 SHAPES_APART = 0.01
 """By which the ratio of a mask's sides may differ from its camera's: sides are whole pixels"""
@@ -61,6 +62,22 @@ class MaskReader(FrameReader):
 def foreground(pixels: np.ndarray) -> np.ndarray:
     """bool [H, W] of a mask as `Views` undistort and scale it, uint8 [H, W, 3]: at least half of the pixel."""
     return np.asarray(pixels[:, :, 0] >= HALF)
+
+
+class Silhouettes:
+    """Where the foreground is in the pictures of some cameras, which are known by name."""
+
+    def __init__(self, masks: Views, *, but: Container[str] = ()) -> None:
+        """`masks` are laid over the pictures, instant by instant; those of some cameras may be left out."""
+        self._masks = masks
+        self._places = {name: place for place, name in enumerate(masks.names) if name not in but}
+
+    def of(self, camera: str, instant: int) -> np.ndarray | None:
+        """bool [H, W] of a picture; None where there is no mask of it."""
+        if camera not in self._places:
+            return None
+        pixels = self._masks.pixels(self._places[camera], instant, remember=False)
+        return None if pixels is None else foreground(pixels)
 
 
 def _labels(path: Path) -> list[str]:

@@ -12,12 +12,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
 
+import cv2
 import numpy as np
 
 from packuv.budget import Budget
 from packuv.files import open_npz, save_npz
-from packuv.footage import Views
+from packuv.footage import Silhouettes, Views
 from packuv.progress import Progress, no_progress
+
+BORDER_PX = 2
+"""Width of the border around masks in which pixels are mixed with the foreground"""
 
 
 @dataclass(frozen=True)
@@ -55,12 +59,14 @@ def find_background(
     options: BackgroundOptions,
     progress: Progress = no_progress,
     *,
+    silhouettes: Silhouettes | None = None,
     least: int = 3,
     among: range | None = None,
     workers: int = 2,
 ) -> list[Still]:
     """Backgrounds of the cameras that filmed at least `least` of the instants chosen `among` some, by default all; an
-    empty stage needs one.
+    empty stage needs one. What `silhouettes` cover, with a border, is no background, and what they leave in fewer than
+    `least` pictures is not known.
 
     `workers` cameras at a time, each with the pictures of all instants in memory.
     """
@@ -69,9 +75,16 @@ def find_background(
     instants = np.unique(np.linspace(among.start, among.stop - 1, count).round().astype(int))
 
     def look(camera: int) -> Still | None:
-        pictures = [views.steady(camera, int(instant), remember=False) for instant in instants]
-        found = [picture for picture in pictures if picture is not None]
-        return _still(camera, np.stack(found), options) if len(found) >= least else None
+        pictures = {int(instant): views.steady(camera, int(instant), remember=False) for instant in instants}
+        found = {instant: picture for instant, picture in pictures.items() if picture is not None}
+        if len(found) < least:
+            return None
+        masks = [silhouettes.of(views.names[camera], instant) for instant in found] if silhouettes else []
+        ahead = [bordered(mask) for mask in masks if mask is not None]
+        stack = np.stack(list(found.values()))
+        if ahead:
+            return _behind(camera, stack, np.stack(ahead), options, least)
+        return _still(camera, stack, options)
 
     stills = []
     with ThreadPoolExecutor(workers) as pool:
@@ -136,6 +149,27 @@ def _still(camera: int, pictures: np.ndarray, options: BackgroundOptions) -> Sti
     for picture in pictures:
         near += apart(picture, median) <= options.tolerance
     return Still(camera, median, near >= needed)
+
+
+def _behind(camera: int, pictures: np.ndarray, ahead: np.ndarray, options: BackgroundOptions, least: int) -> Still:
+    """`_still` of those pictures of each pixel in which nothing stands before it; `ahead` is bool [n, H, W]."""
+    free = len(pictures) - ahead.sum(axis=0)  # [H, W]
+    ordered = np.where(ahead[..., None], np.uint16(256), pictures)
+    ordered.sort(axis=0)
+    middle = np.minimum(free // 2, len(pictures) - 1)
+    found = np.take_along_axis(ordered, middle[None, :, :, None], axis=0)[0]
+    median = np.where(free[:, :, None] > 0, found, pictures[0]).astype(np.uint8)
+    near = np.zeros(free.shape, np.int32)
+    for picture, hidden in zip(pictures, ahead, strict=True):
+        near += ~hidden & (apart(picture, median) <= options.tolerance)
+    return Still(camera, median, (free >= least) & (near >= options.agreement * free))
+
+
+def bordered(mask: np.ndarray) -> np.ndarray:
+    """A mask, bool [H, W], with the border of mixed pixels around it."""
+    side = 2 * BORDER_PX + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
 
 
 def median_of(pictures: np.ndarray) -> np.ndarray:

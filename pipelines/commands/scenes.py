@@ -230,6 +230,14 @@ def _scores_text(facts: Mapping[str, Any]) -> str:
     lines += ["", f"{'calibrated':<12}" + "".join(f"{text:>16}" for text in _APART)]
     for name, means in rows.items():
         lines.append(f"{name:<12}" + "".join(f"{_figure(means[key], how):>16}" for key, how in _APART.values()))
+    if "psnr_foreground_db" in facts["mean"]:
+        lines += ["", f"{'foreground':<12}" + "".join(f"{text:>16}" for text in _FOREGROUND)]
+        for name, means in rows.items():
+            lines.append(
+                f"{name:<12}" + "".join(f"{_figure(means[key], how):>16}" for key, how in _FOREGROUND.values())
+            )
+    for name, why in facts.get("doubtful_masks", {}).items():
+        lines.append(f"masks of {name} are not used: {why}")
     what = "held out, never fitted" if facts["held_out"] else "not all held out"
     lines.append(f"{facts['frames']} frames, {size_text(facts['bytes_per_frame'])} a frame; cameras {what}")
     return "\n".join(lines)
@@ -245,6 +253,12 @@ _APART = {
     "LPIPS": ("lpips", ".4f"),
 }
 """Heads of columns: the figure, and its form"""
+_FOREGROUND = {
+    "PSNR dB": ("psnr_foreground_db", ".2f"),
+    "SSIM": ("ssim_foreground", ".4f"),
+    "LPIPS": ("lpips_foreground", ".4f"),
+    "share": ("foreground_share", ".3f"),
+}
 
 
 def _figure(value: float | None, how: str) -> str:

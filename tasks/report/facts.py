@@ -150,6 +150,10 @@ class FrameScore:
     """Difference of motion, pixels"""
     flicker: float | None = None
     lpips: float | None = None
+    foreground_db: float | None = None
+    """Where the camera's mask has foreground; None without a mask, as below"""
+    foreground_ssim: float | None = None
+    foreground_lpips: float | None = None
 
     @property
     def level_db(self) -> float:
@@ -290,7 +294,7 @@ class ReportInput:
     """By camera; empty where no points were triangulated"""
     content: Content | None = None
     masks: Mapping[str, str] = field(default_factory=dict)
-    """Fitted cameras whose foreground masks are not to be believed, and why"""
+    """Cameras whose foreground masks are not used, and why"""
     footage: tuple[str, ...] = ()
     """What was read of the videos and what was not, where it is not plain, and which pictures are damaged"""
     colours: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -376,12 +380,14 @@ LEVELS = {
     "never_moving_db": "never moving",
 }
 """Ratios that a score holds, dB, and what people call them"""
+FOREGROUND = {"foreground_db": "PSNR dB", "foreground_ssim": "SSIM", "foreground_lpips": "LPIPS"}
+"""What a score holds of the foreground where there are masks, likewise"""
 
 
 def mean_of(scores: Sequence[FrameScore], name: str) -> float | None:
     """Mean of a figure over the scores that have it; ratios of equal pictures count as `MAX_PSNR_DB`."""
     known = [value for score in scores if (value := getattr(score, name)) is not None]
-    return float(np.mean(np.minimum(known, MAX_PSNR_DB) if name in LEVELS else known)) if known else None
+    return float(np.mean(np.minimum(known, MAX_PSNR_DB) if name.endswith("_db") else known)) if known else None
 
 
 def still_trend(scores: Sequence[FrameScore]) -> float | None:

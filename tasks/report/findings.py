@@ -262,10 +262,10 @@ def _mask_findings(report: ReportInput) -> Iterator[Finding]:
     for name, why in report.masks.items():
         yield Finding(
             "motion",
-            f"Masks of {name}: {why}.".replace("?.", "?"),
+            f"Masks of {name} are not used: {why}.".replace("?.", "?"),
             cure="Lay a mask over the picture of its number; make the masks anew, or take them out of masks/.",
             camera=name,
-            many="cameras have masks that do not fit what moves",
+            many="cameras have masks that do not fit what moves and are not used",
         )
 
 

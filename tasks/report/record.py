@@ -10,6 +10,7 @@ import numpy as np
 
 from tasks.artefacts.recipe import plain
 from tasks.report.facts import (
+    FOREGROUND,
     LEVELS,
     MAX_PSNR_DB,
     FrameScore,
@@ -89,7 +90,8 @@ def _scene_json(scene: SceneFigures, every: int) -> dict[str, Any]:
 
 def _score_json(score: FrameScore) -> dict[str, Any]:
     levels = {name: min(value, MAX_PSNR_DB) for name in LEVELS if (value := getattr(score, name)) is not None}
-    return {**vars(score), **levels}
+    known = {name: value for name, value in vars(score).items() if value is not None or name not in FOREGROUND}
+    return {**known, **levels}
 
 
 def _cameras_json(report: ReportInput) -> list[dict[str, Any]]:

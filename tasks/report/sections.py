@@ -18,6 +18,7 @@ from sync.align import CameraReport, SyncReport
 from sync.clock import ClockMode
 from tasks.artefacts.recipe import plain
 from tasks.report.facts import (
+    FOREGROUND,
     LEVELS,
     FrameScore,
     ReportInput,
@@ -279,6 +280,7 @@ def _quality(report: ReportInput, limits: Limits) -> Body:
         "cameras": [_score_row(name, own, level[name], low, limits) for name, own in cameras.items()],
         "kinds": list(LEVELS.values()),
         "areas": _areas(report),
+        "foreground": any(score.foreground_db is not None for score in report.scores),
         "trend_db": still_trend(report.scores),
     }
 
@@ -349,7 +351,7 @@ def _score_row(camera: str, own: Sequence[FrameScore], mean_db: float, low: floa
         "levels": [mean_of(own, name) for name in LEVELS],
         "trend_db": slope,
         "falls": slope is not None and slope < -limits.still_fall_db,
-        **{name: mean_of(own, name) for name in ("tof_px", "flicker", "lpips")},
+        **{name: mean_of(own, name) for name in ("tof_px", "flicker", "lpips", *FOREGROUND)},
         "pictures": len(own),
     }
 

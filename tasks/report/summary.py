@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from tasks.report.facts import LEVELS, FrameScore, ReportInput, by_camera, mean_of, still_trend
+from tasks.report.facts import FOREGROUND, LEVELS, FrameScore, ReportInput, by_camera, mean_of, still_trend
 
 
 def summary(report: ReportInput) -> dict[str, Any]:
     """The figures that one quotes; None where there is none. Means run over cameras first, then over frames."""
     cameras = by_camera(report.scores)
     scene, rig = report.scene, report.rig
+    ahead = {name: value for name in FOREGROUND if (value := _over_cameras(cameras, name)) is not None}
     work = sum(stage.seconds for stage in report.stages) if report.stages else None
     return {
         "psnr_db": _mean([np.mean([score.level_db for score in own]) for own in cameras.values()]),
@@ -21,6 +22,7 @@ def summary(report: ReportInput) -> dict[str, Any]:
         **{f"psnr_{name}": _over_cameras(cameras, name) for name in LEVELS if name != "psnr_db"},
         "still_trend_db": still_trend(report.scores),
         **{name: _over_cameras(cameras, name) for name in ("tof_px", "flicker", "lpips")},
+        **ahead,
         "scored_cameras": sorted(cameras),
         "mb_per_30_frames": scene.mb_per_30_frames if scene else None,
         "seconds": report.seconds if report.seconds is not None else work,

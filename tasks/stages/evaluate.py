@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,23 @@ import numpy as np
 
 from packuv.bounds import MOST_CAMERAS, MOST_NS, MOST_SIDE_PX, field, fields, items, whole
 from packuv.files import save_json
-from packuv.footage import LensCamera, Light, Transfer, Views
+from packuv.footage import LensCamera, Light, MaskReader, Silhouettes, Transfer, Views
 from packuv.footage.light import unpacked
 from packuv.lpips import Lpips, lacking
+from packuv.motion import MotionOptions, measure_motion
+from packuv.motion.foreground import compare_masks
 from packuv.progress import Progress
 from packuv.scene import SceneHeader, open_scene
 from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
 from sync.align import AlignOptions, FrameGroups, align
-from sync.capture import find_capture, load_timecodes, probe_capture
+from sync.capture import find_capture, find_masks, load_timecodes, probe_capture
 from sync.clock import ClockMode
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.report.facts import FrameScore, frames_to_picture
 from tasks.stages.encode import SCENE
 from tasks.stages.footage import Footage, Take
+from tasks.stages.masks import doubts
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import STARTS_NS, begun
 
@@ -49,7 +53,8 @@ class EvaluateOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Stage):
-    """Score every frame of the scene file on the cameras of a take: metrics.json, metrics.arrow, pictures/."""
+    """Score every frame of the scene file on the cameras of a take, and the foreground where masks tell it:
+    metrics.json, metrics.arrow, pictures/."""
 
     name, version = "evaluate", 4
     take: Take
@@ -62,10 +67,12 @@ class Evaluate(Stage):
     """Why LPIPS is not measured"""
 
     def build(self, work: Work) -> Notes:
-        views, scene = Footage(self.take, work.site).open_views(), work.path(self.scene) / SCENE
+        footage, scene = Footage(self.take, work.site), work.path(self.scene) / SCENE
+        views, silhouettes = footage.open_views(), footage.open_silhouettes()
         lpips = Lpips(Path(self.weights)) if self.backbone else None
         with open_scene(scene) as opened:
-            scores = score(opened, views, work.progress, lpips=lpips, workers=work.site.threads, scratch=work.scratch)
+            scores = score(opened, views, work.progress, lpips=lpips, silhouettes=silhouettes,
+                           workers=work.site.threads, scratch=work.scratch)  # fmt: skip
             write_table(work.out / TABLE, scores)
             write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
             borders = segment_starts(opened)
@@ -91,7 +98,8 @@ def evaluate_scene(
 
     The frames of the capture are matched again as the scene's header says, and found by their times. Raises
     ValueError for a camera that the scene does not know, or a capture that did not film the scene's instants; where
-    weights for LPIPS are named, but it cannot be measured with them.
+    weights for LPIPS are named, but it cannot be measured with them. Where masks do not fit what moves, they are not
+    used, and `doubtful_masks` says why, by camera.
     """
     weights = Path(options.lpips_weights) if options.lpips_weights else None
     if weights and (why := lacking(weights)):
@@ -116,8 +124,27 @@ def evaluate_scene(
             transfer=Transfer(said) if said else None,
             light=_light(header).of(names, len(frames)),
         )
-        scores = score(opened, views, progress, lpips=Lpips(weights) if weights else None)
-        return summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
+        silhouettes, doubtful = _silhouettes(capture, views)
+        scores = score(opened, views, progress, lpips=Lpips(weights) if weights else None, silhouettes=silhouettes)
+        facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
+        return {**facts, "doubtful_masks": doubtful} if doubtful else facts
+
+
+def _silhouettes(capture: Path, views: Views) -> tuple[Silhouettes | None, dict[str, str]]:
+    """The foreground by the capture's masks, and by camera why masks are left out."""
+    masks = {name: path for name, path in find_masks(find_capture(capture)).items() if name in views.names}
+    if not masks:
+        return None, {}
+    columns = [views.names.index(name) for name in masks]
+    sizes = {name: (views.lenses[column].pinhole.width, views.lenses[column].pinhole.height)
+             for name, column in zip(masks, columns, strict=True)}  # fmt: skip
+    laid = Views(masks, views.frames[:, columns], [views.lenses[column] for column in columns],
+                 max_width=views.max_width, reader=MaskReader(masks, sizes))  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        cache = measure_motion(views, Path(folder), MotionOptions(keep_flow=False))
+        agreed = {name: asdict(compare_masks(laid, cache, place)) for place, name in enumerate(masks)}
+    doubtful = doubts({"cameras": agreed})
+    return Silhouettes(laid, but=doubtful), doubtful
 
 
 def _lenses(extra: Mapping[str, Any]) -> dict[str, LensCamera]:
@@ -180,6 +207,9 @@ def frame_scores(scores: Sequence[Score]) -> tuple[FrameScore, ...]:
             tof_px=item.tof_px,
             flicker=item.flicker,
             lpips=item.lpips,
+            foreground_db=item.psnr_foreground_db,
+            foreground_ssim=item.ssim_foreground,
+            foreground_lpips=item.lpips_foreground,
         )
         for item in scores
     )

@@ -62,8 +62,9 @@ class FindBackground(Stage):
     options: BackgroundOptions
 
     def build(self, work: Work) -> Notes:
-        views, threads = Footage(self.take, work.site).open_views(), work.site.threads
-        stills = find_background(views, self.options, work.progress, workers=threads)
+        footage, threads = Footage(self.take, work.site), work.site.threads
+        stills = find_background(footage.open_views(), self.options, work.progress,
+                                 silhouettes=footage.open_silhouettes(), workers=threads)  # fmt: skip
         save_stills(work.out / STILLS, stills)
         return {"cameras": len(stills), "known_share": float(np.mean([still.known.mean() for still in stills] or [0]))}
 
@@ -80,7 +81,9 @@ class UsePlate(Stage):
 
     def build(self, work: Work) -> Notes:
         footage, cameras = Footage(self.take, work.site), self.take.cameras
-        own = {cameras[s.camera]: s for s in find_background(footage.open_views(), self.options, work.progress)}
+        found = find_background(footage.open_views(), self.options, work.progress,
+                                silhouettes=footage.open_silhouettes())  # fmt: skip
+        own = {cameras[still.camera]: still for still in found}
         videos = {name: video for name, video in find_plate(find_capture(work.site.capture)).items() if name in cameras}
         views = footage.open_plate(videos, self.options.instants)
         shown = {views.names[s.camera]: s for s in find_background(views, self.options, work.progress, least=1)}
@@ -151,11 +154,14 @@ class PatchBackground(Stage):
         return f"background of epoch {self.epoch + 1}"
 
     def build(self, work: Work) -> Notes:
-        views, found = Footage(self.take, work.site).open_views(), read_patches(work.path(self.patches)).found
+        footage, found = Footage(self.take, work.site), read_patches(work.path(self.patches)).found
+        views, silhouettes = footage.open_views(), footage.open_silhouettes()
         among = epochs([patch.date for patch in found], len(views))[self.epoch]
         own = {
             still.camera: still
-            for still in find_background(views, self.options, work.progress, among=among, workers=work.site.threads)
+            for still in find_background(
+                views, self.options, work.progress, silhouettes=silhouettes, among=among, workers=work.site.threads
+            )
         }
         stills = []
         for usual in _stills(work, self.background, views.budget):
@@ -249,11 +255,13 @@ class FitNext(Stage):
         before = KeyState.load(work.path(self.previous))
         if self.end:
             before = tail(before, Segment.load(work.path(self.end) / SEGMENT))
-        views = Footage(self.take, work.site).open_views(spill=work.scratch)
+        footage = Footage(self.take, work.site)
+        views = footage.open_views(spill=work.scratch)
         state = fit_next(
             before,
             views,
             self.instant,
+            silhouettes=footage.open_silhouettes(),
             stills=_stills(work, self.background, views.budget),
             motion=self.motion,
             options=self.options,

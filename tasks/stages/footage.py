@@ -20,6 +20,7 @@ from packuv.footage import (
     LensCamera,
     Light,
     MaskReader,
+    Silhouettes,
     Transfer,
     Views,
     WatchingReader,
@@ -27,8 +28,8 @@ from packuv.footage import (
     without,
 )
 from sync.align import FrameGroups
-from sync.capture import find_capture
-from tasks.artefacts.stage import Site
+from sync.capture import find_capture, find_masks
+from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key
 from tasks.stages.synchronize import read_videos, selected
 
@@ -81,6 +82,14 @@ class Take:
     stop: int | None = None
     """The instant after the last one; None, to the end, for a stage that is told its instants"""
     pictures: PictureOptions = PictureOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskedTake(Take):
+    """A take of which masks tell the foreground."""
+
+    masks: Files
+    """By camera; those of other cameras do not matter"""
 
 
 @dataclass(frozen=True)
@@ -166,10 +175,15 @@ class Footage:
         pictures = self.take.pictures
         return Views(videos, frames, lenses, max_width=pictures.max_width, transfer=pictures.transfer, reader=reader)
 
-    def open_masks(self, masks: Mapping[str, Path]) -> Views:
-        """Foreground masks of some of this take's cameras, laid over the pictures that `open_views` gives; see
-        `packuv.footage.foreground`."""
-        rig, groups = self.load_rig(), self.load_groups()
+    def open_silhouettes(self) -> Silhouettes | None:
+        """The foreground of the take, if masks tell it."""
+        return Silhouettes(self.open_masks(self.take.masks)) if isinstance(self.take, MaskedTake) else None
+
+    def open_masks(self, files: Files) -> Views:
+        """Foreground masks of those of this take's cameras that have some among the files, laid over the pictures that
+        `open_views` gives; see `packuv.footage.foreground`."""
+        rig, groups, found = self.load_rig(), self.load_groups(), find_masks(find_capture(self.site.capture))
+        masks = {name: found[name] for name in self.take.cameras if name in files.sha256}
         sizes = {name: (rig[name].width, rig[name].height) for name in masks}
         frames = groups.frames[:, [groups.cameras.index(name) for name in masks]]
         lenses = [lens_camera(rig[name]) for name in masks]

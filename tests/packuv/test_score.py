@@ -12,14 +12,27 @@ import pytest
 
 from packuv.camera import PinholeCamera
 from packuv.colour import lit
-from packuv.footage import LensCamera, Views
+from packuv.footage import LensCamera, Silhouettes, Views
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Quantizer, attribute_values
 from packuv.gaussians.floats import with_canonical_axes
 from packuv.gaussians.segment import Segment
-from packuv.metrics import psnr
+from packuv.metrics import cut_out, psnr, ssim
 from packuv.progress import no_progress
 from packuv.scene import SceneHeader, open_scene, write_scene
-from packuv.score import BLOCKS, FIGURES, SCHEMA, Artist, Score, _Watch, score
+from packuv.score import (
+    BLOCKS,
+    COLUMNS,
+    FIGURES,
+    FOREGROUND,
+    SCHEMA,
+    Artist,
+    Score,
+    _Watch,
+    read_table,
+    score,
+    summary,
+    write_table,
+)
 from tests.support.splats import wall
 
 
@@ -48,7 +61,8 @@ def test_the_table_has_the_columns_that_stores_hold():
 
 
 def test_every_field_is_a_column_and_every_figure_has_a_mean():
-    assert SCHEMA.names == [field.name for field in fields(Score)]
+    assert COLUMNS.names == [field.name for field in fields(Score)]
+    assert [*SCHEMA.names, *FOREGROUND] == COLUMNS.names
     assert tuple(name for name in SCHEMA.names if name not in ("frame", "time_ns", "camera", "held_out")) == FIGURES
 
 
@@ -142,6 +156,71 @@ def test_scores_do_not_depend_on_the_number_of_workers(tmp_path):
         one, many = (score(scene, Views(videos, frames, lenses), no_progress, workers=n) for n in (1, 3))
     assert one == many
     assert [(item.frame, item.camera) for item in one] == [(0, "a"), (0, "b"), (1, "a"), (2, "a"), (2, "b")]
+
+
+# ---- the foreground
+
+
+def test_the_foreground_is_scored_where_masks_tell_it_and_nothing_else_changes(tmp_path):
+    path = write_wall(tmp_path / "lit.mkv", 0 * LIGHT)
+    rng = np.random.default_rng(0)
+    pictures = rng.random((3, 3, 64, 96)).astype(np.float32)
+    film(tmp_path / "a.mp4", pictures)
+    masks = np.zeros((3, 64, 96), np.float32)
+    masks[0, 10:40, 20:30] = masks[1] = 1  # none in the last frame
+    film(tmp_path / "mask.mp4", np.repeat(masks[:, None], 3, axis=1))
+    lenses = [LensCamera(replace(CAMERA, name=name)) for name in "ab"]
+    frames = np.arange(3)[:, None]
+    silhouettes = Silhouettes(Views({"a": tmp_path / "mask.mp4"}, frames, lenses[:1]))
+    views = Views({name: tmp_path / "a.mp4" for name in "ab"}, np.repeat(frames, 2, axis=1), lenses)
+    perceived = []
+
+    def measure(picture, truth):
+        perceived.append(picture.shape[1:])
+        return float(np.abs(picture - truth).mean())
+
+    with open_scene(path) as scene:
+        drawn = Artist(scene).draw(scene.gaussians(0), CAMERA)
+        plain = score(scene, views, no_progress)
+        found = score(scene, views, no_progress, silhouettes=silhouettes)
+        score(scene, views, no_progress, silhouettes=silhouettes, lpips=measure)
+    bare = [replace(item, **dict.fromkeys(FOREGROUND)) for item in found]
+    assert bare == plain
+    own = {(item.camera, item.frame): item for item in found}
+    assert all(getattr(own[key], name) is None for key in own if key[0] == "b" or key[1] == 2 for name in FOREGROUND)
+
+    part, whole = own["a", 0], own["a", 1]
+    shown, truth = np.clip(drawn, 0, 1), views.filmed(0, 0)
+    box = np.s_[:, 10:40, 20:30]
+    assert part.foreground_share == pytest.approx(300 / (64 * 96))
+    assert part.psnr_foreground_db == pytest.approx(psnr(shown[box], truth[box]), abs=0.05)  # of clipped values
+    around = np.zeros((3, 64, 96), np.float32), np.zeros((3, 64, 96), np.float32)
+    around[0][box], around[1][box] = shown[box], truth[box]
+    wide = np.s_[:, 10:40, 19:30]  # as wide as the window of SSIM
+    assert part.ssim_foreground == pytest.approx(ssim(around[0][wide], around[1][wide]), abs=1e-3)
+    assert whole.psnr_foreground_db == pytest.approx(whole.psnr_calibrated_db, abs=0.05)
+    assert whole.ssim_foreground == pytest.approx(whole.ssim_calibrated, abs=1e-3)
+    assert sorted(set(perceived)) == [(64, 64), (64, 96)]
+
+    write_table(tmp_path / "found.arrow", found)
+    assert list(read_table(tmp_path / "found.arrow")) == found
+    means = [summary(part, frames=3, size_bytes=1, borders=[]) for part in (found, plain)]
+    assert means[0]["by_camera"]["b"]["psnr_foreground_db"] is None
+    assert means[0]["mean"]["ssim_foreground"] == pytest.approx((part.ssim_foreground + whole.ssim_foreground) / 2)
+    assert set(means[0]["mean"]) - set(means[1]["mean"]) == set(FOREGROUND)
+
+
+def test_a_box_lies_within_the_picture_and_around_the_mask():
+    rng = np.random.default_rng(4)
+    picture = rng.random((3, 40, 50)).astype(np.float32)
+    for _ in range(50):
+        mask = np.zeros((40, 50), bool)
+        rows, columns = np.sort(rng.choice(40, 2, replace=False)), np.sort(rng.choice(50, 2, replace=False))
+        mask[rows[0] : rows[1], columns[0] : columns[1]] = True
+        cut = cut_out(picture, mask, least_px=16)
+        assert cut.shape[1:] == tuple(max(16, b - a) for a, b in (rows, columns))
+        assert cut.sum() == pytest.approx(picture[:, mask].sum(), rel=1e-4)
+    assert cut_out(picture, mask, least_px=64).shape == picture.shape
 
 
 # ---- moving and still areas

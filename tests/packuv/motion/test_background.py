@@ -2,8 +2,9 @@ import av
 import numpy as np
 import pytest
 
-from packuv.footage import LensCamera, Views
+from packuv.footage import LensCamera, Silhouettes, Views
 from packuv.motion import BackgroundOptions, find_background, load_stills, save_stills
+from packuv.motion.background import bordered
 
 FRAMES, HEIGHT, WIDTH = 9, 48, 64
 
@@ -46,6 +47,28 @@ def test_where_somebody_stands_for_long_is_told_from_what_is_known(views):
     # Two thirds of the instants show the square at columns 18 to 25: fewer than four fifths.
     assert not standing.known[10:20, 18:26].any()
     assert standing.known[30:].all()
+
+
+def test_what_masks_cover_is_no_background_and_what_they_leave_too_seldom_is_unknown(views, tmp_path):
+    covered = np.stack([scene(instant, stops=True)[:, :, 0] == 250 for instant in range(FRAMES)])
+    with av.open(str(tmp_path / "mask.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
+        for mask in covered:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(255 * mask.astype(np.uint8), format="gray")))
+        container.mux(stream.encode())
+    masks = Views({"cam1": tmp_path / "mask.mkv"}, views.frames[:, 1:2], views.lenses[1:2])
+    silhouettes, options = Silhouettes(masks), BackgroundOptions(instants=FRAMES)
+    free = (~np.stack([bordered(mask) for mask in covered])).sum(axis=0)
+    empty = np.broadcast_to(np.linspace(20, 120, WIDTH).astype(np.uint8)[None, :, None], (HEIGHT, WIDTH, 3))
+    for least in (1, 3):
+        still = find_background(views, options, silhouettes=silhouettes, least=least)[1]
+        np.testing.assert_array_equal(still.known, free >= least)
+        np.testing.assert_array_equal(still.pixels[still.known], empty[still.known])
+    assert (free < 3).any()
+    assert (find_background(views, options)[1].pixels[10:20, 20:24] == 250).all()  # as it is without masks
+    other, plain = (find_background(views, options, silhouettes=one)[0] for one in (silhouettes, None))
+    np.testing.assert_array_equal(other.pixels, plain.pixels)  # of a camera without masks
 
 
 def test_cameras_that_filmed_too_little_have_no_background(views):

@@ -20,9 +20,11 @@ import cv2
 import numpy as np
 import pytest
 
+from packuv.footage import FrameReader
 from pipelines.cli import FAILED, OK, WRONG, main
 from pipelines.commands import run as command
 from pipelines.results import WHOLE, check_whole
+from sync.capture import find_capture
 from tasks.artefacts.store import Store
 from tests.support.golden import FOLDER, SETTINGS
 from tests.support.places import ROOT
@@ -176,6 +178,59 @@ def test_a_whole_run_has_all_its_files(tmp_path, monkeypatch, capsys, lost):
     assert main([*asked, "--stop-after", "flow"]) == OK
     assert main(asked) == FAILED
     assert f"{tmp_path / lost} is not there" in capsys.readouterr().err
+
+
+def write_masks(capture: Path, *cameras: str, empty: tuple[str, ...] = ()) -> None:
+    """Of what is not as it mostly is; of some cameras empty ones."""
+    reader = FrameReader(find_capture(capture).videos)
+    for name in (*cameras, *empty):
+        pictures = np.stack([reader.read(name, frame) for frame in range(reader.frame_count(name))]).astype(int)
+        folder = capture / "masks" / name
+        folder.mkdir(parents=True)
+        for frame, picture in enumerate(pictures):
+            ahead = np.abs(picture - np.median(pictures, axis=0)).max(axis=2) > 20
+            grown = cv2.dilate(ahead.astype(np.uint8), np.ones((5, 5), np.uint8))
+            cv2.imwrite(str(folder / f"{frame:06d}.png"), 255 * grown * (name not in empty))
+
+
+def made_in(out: Path) -> dict[str, list[str]]:
+    """Artefacts of the last run by stage."""
+    found = dict[str, list[str]]()
+    (told,) = (json.loads(path.read_text()) for path in out.glob("*/run.json"))
+    for item in told["artefacts"]:
+        found.setdefault(item["artefact"].partition("/")[0], []).append(item["artefact"])
+    return found
+
+
+@pytest.mark.slow
+def test_masks_that_come_later_redo_what_they_are_used_for_and_doubtful_ones_nothing(tmp_path, capsys):
+    capture, out = shutil.copytree(CAPTURE, tmp_path / "capture"), tmp_path / "out"
+    asked = ["run", str(capture), *words(out, "--direct")[5:]]
+    assert main(asked) == OK
+    plain, scene = made_in(out), next(out.glob("*/scene.mkv")).read_bytes()
+    write_masks(capture, empty=("cam02", "cam03"))  # the second of which is held out
+    assert main(asked) == OK
+    doubtful = made_in(out)
+    assert len(doubtful.pop("masks")) == 2
+    assert len(doubtful.pop("mask_files")) == 1
+    assert doubtful == plain
+    assert "2 cameras have masks that do not fit what moves and are not used: cam02, cam03" in capsys.readouterr().out
+
+    shutil.rmtree(capture / "masks")
+    write_masks(capture, "cam01", "cam03", empty=("cam02",))
+    assert main(asked) == OK
+    masked = made_in(out)
+    changed = {stage for stage in plain if masked[stage] != plain[stage]}
+    assert changed == {"background", "backdrop", "key", "segment", "encode", "verify", "evaluate"}
+    (told,) = (json.loads(path.read_text()) for path in out.glob("*/run.json"))
+    scores = next(item["notes"]["mean"] for item in told["artefacts"] if item["artefact"].startswith("evaluate/"))
+    assert 0 < scores["foreground_share"] < 0.5
+    assert scores["psnr_foreground_db"] > 5
+
+    shutil.rmtree(capture / "masks")
+    assert main(asked) == OK
+    assert made_in(out) == plain
+    assert next(out.glob("*/scene.mkv")).read_bytes() == scene
 
 
 def test_masks_that_do_not_fit_their_camera_end_a_run_before_any_work(tmp_path, capsys):

@@ -15,7 +15,7 @@ from tasks.artefacts.store import Key
 from tasks.report.facts import ReportInput
 from tasks.report.findings import findings
 from tasks.stages.footage import RIG, Take
-from tasks.stages.masks import CheckMasks, doubts
+from tasks.stages.masks import CheckMasks, CheckUnseenMasks, believed, doubts
 from tasks.stages.track import FindMotion
 from tests.support.artefacts import build_here, put
 from tests.support.balls import covered
@@ -69,6 +69,20 @@ def test_masks_of_what_moves_are_believed(measured: tuple[Site, Take, Key], tmp_
     assert facts["outside_share"] < BORDER
     assert facts["fit"]["shift_px"] == NONE
     assert not doubts(notes)
+    assert believed(notes) == ["cam0"]
+
+
+def test_masks_of_cameras_whose_motion_nobody_measured_are_checked_alike(
+    measured: tuple[Site, Take, Key], tmp_path: Path
+) -> None:
+    site, take, _ = measured
+    write_masks(site.capture, {"cam0": NONE, "cam1": MOVED})
+    whole = compared(measured, tmp_path / "seen")
+    masks = Files({"cam0": "content", "cam1": "content"})
+    check = CheckUnseenMasks(take=take, masks=masks, motion_options=MOTION_OPTIONS)
+    notes, _ = build_here(check, site, tmp_path / "unseen")
+    assert notes == whole
+    assert [what for what, _ in check.spared(tmp_path, notes)] == ["masks of cam1"]
 
 
 def test_moved_and_empty_masks_are_named_with_where_they_fit(measured: tuple[Site, Take, Key], tmp_path: Path) -> None:
@@ -80,7 +94,8 @@ def test_moved_and_empty_masks_are_named_with_where_they_fit(measured: tuple[Sit
     }
     assert list(doubts(notes)) == ["cam0", "cam1"]
     (told,) = findings(ReportInput("balls", masks=doubts(notes)))
-    assert "2 cameras have masks that do not fit what moves: cam0, cam1" in told.text
+    assert "2 cameras have masks that do not fit what moves and are not used: cam0, cam1" in told.text
+    assert not believed(notes)
 
     for path in (measured[0].capture / "masks" / "cam1").iterdir():
         cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint8))
