@@ -108,7 +108,7 @@ def place_by_others(
     """
     others = [name for name in rig.names if name != camera.name]
     xyz, pixels = _located(rig, camera.name, others, _partners(matches), options)
-    flat = camera.plane_from_pixels(pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    flat = camera.undistorted_pixels(pixels)
     best = _resected(camera, xyz, flat, options) if len(xyz) >= options.min_points else None
     if best is None:
         return None
@@ -147,7 +147,7 @@ def _standing(rig: Rig, name: str, others: Sequence[str], partners: Partners, op
     """None without enough points that one pose explains."""
     camera = rig[name]
     xyz, pixels = _located(rig, name, others, partners, options)
-    flat = camera.plane_from_pixels(pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    flat = camera.undistorted_pixels(pixels)
     while len(xyz) >= options.min_points and (best := _resected(camera, xyz, flat, options)) is not None:
         errors, agrees = _errors_px(camera, xyz, flat), _errors_px(best, xyz, flat) <= options.max_error_px
         turned_deg, shifted = _apart(camera, best, rig)
