@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ class Room:
             options = SimulateOptions(self.cameras, INSTANTS, self.size, seed=self.seed, crowd=self.crowd)
             clock = ClockOptions(drop_share=0, max_late_frames=0)
             rig = PlacementOptions(self.kind)
-            simulate(folder, replace(options, fps=2, clock=clock, rig=rig, truth=TruthKind.LIGHT))
+            simulate(folder, replace(options, fps=Fraction(2), clock=clock, rig=rig, truth=TruthKind.LIGHT))
         return folder
 
 
@@ -172,13 +173,13 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     for cameras in sorted({row["cameras"] for row in rows}):
         for fault in (RIGHT, *FAULTS, SWAPPED):
             own = [row for row in rows if (row["cameras"], row["fault"]) == (cameras, fault)]
-            missed = sum(bool(row["whom"]) and not missed_nothing(row) for row in own)
+            missed = sum(bool(row["whom"]) and not noticed(row) for row in own)
             false = sum(len(row["false"]) for row in own) + sum(row["refused"] and not row["whom"] for row in own)
             lines.append(f"| {cameras} | {fault} | {len(own)} | {missed} | {false} |")
     return "\n".join(lines)
 
 
-def missed_nothing(row: Mapping[str, Any]) -> bool:
+def noticed(row: Mapping[str, Any]) -> bool:
     """Whether a fault is refused, or named, by camera or as one of the whole calibration."""
     return bool(row["refused"] or row["whole"] or row["named"])
 
