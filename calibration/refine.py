@@ -52,7 +52,7 @@ class RefineOptions:
     swaying: float = 0.004
     """And, of a rig that was solved without known lenses, one that goes by more than this share of the radius when
     lenses are freed (`sway`). The freed ones are off by 0.6 % themselves, so beyond this 1 % is not kept: in
-    "basketball" all 14 cameras off by more than that go by 0.46 % or more"""
+    "basketball" all 13 cameras off by more than that go by 0.58 % or more"""
 
     def __post_init__(self) -> None:
         if self.least_tracks < 1 or not 0 <= self.level_gain <= self.gain < 1 or self.sure < 0:
