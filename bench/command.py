@@ -15,6 +15,7 @@ BENCHMARKS = (
     "codec",
     "compression",
     "content",
+    "doubts",
     "forecast",
     "front_end",
     "kills",

@@ -270,7 +270,7 @@ def matches_report(
     options: MatchOptions = MatchOptions(),
 ) -> MatchesReport:
     """Judge poses and lenses by verified matches (`triangulate.verified_matches`)."""
-    telling = [pair for pair in _merged(matches) if len(pair.first_pixels) >= options.min_matches]
+    telling = [pair for pair, _ in merged(matches) if len(pair.first_pixels) >= options.min_matches]
     errors = [pair_errors_px(rig, pair) for pair in telling]
     shares = [float((error <= options.max_error_px).mean()) for error in errors]
     bad = {pair.key: share for pair, share in zip(telling, shares, strict=True) if share < options.bad_share}
@@ -290,17 +290,20 @@ def matches_report(
     )
 
 
-def _merged(matches: Sequence[PairMatches]) -> list[PairMatches]:
-    """One entry for each pair of cameras: what several instants show of it, put together."""
+def merged(matches: Sequence[PairMatches]) -> list[tuple[PairMatches, int]]:
+    """One entry for each pair of cameras: what several instants show of it, put together, and how many those are."""
     groups: dict[str, list[PairMatches]] = {}
     for pair in matches:
         groups.setdefault(pair.key, []).append(pair)
     return [
-        PairMatches(
-            group[0].first,
-            group[0].second,
-            np.concatenate([pair.first_pixels for pair in group]),
-            np.concatenate([pair.second_pixels for pair in group]),
+        (
+            PairMatches(
+                group[0].first,
+                group[0].second,
+                np.concatenate([pair.first_pixels for pair in group]),
+                np.concatenate([pair.second_pixels for pair in group]),
+            ),
+            len(group),
         )
         for group in groups.values()
     ]

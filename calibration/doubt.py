@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.accept import MatchesReport, MatchOptions, PairMatches, Verdict, pair_errors_px
+from calibration.accept import MatchesReport, MatchOptions, PairMatches, Verdict, merged, pair_errors_px
 from calibration.moved import find_moved
 from calibration.rig import Camera, Rig
+from calibration.triangulate import on_one_geometry
 
 FOCAL_SCALES = (0.8, 0.85, 0.91, 0.95, 1.05, 1.1, 1.18, 1.25)
 BENDS = (-0.3, -0.15, -0.07, -0.03, 0.03, 0.07, 0.15, 0.3)
@@ -36,6 +37,9 @@ class DoubtOptions:
     """... and at least this many times that of the other cameras: what all have is said of the calibration"""
     accusing: int = 2
     """Pairs that must speak against a camera: patterns that repeat let a single one match on a geometry of its own"""
+    accusing_matches: int = 30
+    """Matches with which a pair speaks against its cameras: in small pictures of look-alike people two or three pairs
+    of a right camera had 20 to 33 by chance, as many as a solve asks of a pair (`SolveOptions.min_pair_matches`)"""
     confirming: int = 8
     """Matches with which a pair speaks for its cameras, where most of them fit: chance ones never do"""
     fitting: float = 0.6
@@ -71,9 +75,10 @@ def doubts(
     """
     if report.verdict is Verdict.UNDECIDED:
         return {WHOLE: f"is neither confirmed nor refuted by the pictures: {report.reason}"}
+    evidence = _of_one_geometry(rig, evidence)
     errors = _errors_px(rig, evidence)
     cleared = _cleared(rig, errors, options)
-    known = _confirming_px(errors, judge, options) | _medians_px(errors, judge.min_matches)
+    known = _confirming_px(errors, judge, options) | _medians_px(errors, options.accusing_matches)
     limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
     chance = {key for key, px in known.items() if key <= cleared and px > limit}
     off, left = _peeled(rig, {key: px for key, px in known.items() if key not in chance}, cleared, options)
@@ -101,16 +106,41 @@ def doubts(
             "principal points, distortion or poses are not those of these videos"
         )
     silent = [name for name in rig.names if not any(name in key for key in known)]
-    found |= {name: "is not confirmed: the pictures have too few matches with its neighbours" for name in silent}
+    found |= {name: UNCONFIRMED for name in silent if name not in found}
     return found
 
 
+UNCONFIRMED = "is not confirmed: the pictures have too few matches with its neighbours"
 WRONG = "its pose, focal length, principal point or distortion is wrong, or its name is another camera's"
 
 Medians = Mapping[frozenset[str], float]
 """By pair of cameras, median Sampson distance of its matches, pixels"""
 Errors = Mapping[frozenset[str], np.ndarray]
 """Likewise, of each match, float64 [K]"""
+
+
+def _of_one_geometry(rig: Rig, evidence: Sequence[PairMatches]) -> list[PairMatches]:
+    """By pair, the matches of all instants that agree on one epipolar geometry, since the rig stands still.
+
+    Each instant's were verified alone, where a geometry of its own explains eight matches and often a dozen by chance.
+    What stands still shows the same wrong matches at every instant, so these count once.
+    """
+    found = []
+    for pair, instants in merged(evidence):
+        if instants == 1:
+            found.append(pair)
+            continue
+        cells = np.floor(np.hstack([pair.first_pixels, pair.second_pixels]))
+        once = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+        pair = replace(pair, first_pixels=pair.first_pixels[once], second_pixels=pair.second_pixels[once])
+        flat = [
+            rig[name].undistorted_pixels(pixels)
+            for name, pixels in ((pair.first, pair.first_pixels), (pair.second, pair.second_pixels))
+        ]
+        kept = on_one_geometry(*flat)
+        if kept is not None:
+            found.append(replace(pair, first_pixels=pair.first_pixels[kept], second_pixels=pair.second_pixels[kept]))
+    return found
 
 
 def _medians_px(errors: Errors, least: int) -> dict[frozenset[str], float]:
@@ -128,11 +158,8 @@ def _confirming_px(errors: Errors, judge: MatchOptions, options: DoubtOptions) -
 
 
 def _errors_px(rig: Rig, evidence: Sequence[PairMatches]) -> dict[frozenset[str], np.ndarray]:
-    """Sampson distances by pair; several instants are put together."""
-    errors: dict[frozenset[str], list[np.ndarray]] = {}
-    for pair in evidence:
-        errors.setdefault(frozenset((pair.first, pair.second)), []).append(pair_errors_px(rig, pair))
-    return {key: np.concatenate(found) for key, found in errors.items()}
+    """Sampson distances by pair."""
+    return {frozenset((pair.first, pair.second)): pair_errors_px(rig, pair) for pair in evidence}
 
 
 def _cleared(rig: Rig, errors: Errors, options: DoubtOptions) -> set[str]:

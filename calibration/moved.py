@@ -99,6 +99,23 @@ def find_moved(
     return found, tuple(name for name in moved if _has_moved(found[name], known, options))
 
 
+def place_by_others(
+    rig: Rig, camera: Camera, matches: Sequence[PairMatches], *, options: MovedOptions = MovedOptions()
+) -> Camera | None:
+    """The camera, which need not be in the rig, where most of the points that the rig's other cameras locate put it.
+
+    Its lens stays, its pose does not count. None without enough points that agree on one pose.
+    """
+    others = [name for name in rig.names if name != camera.name]
+    xyz, pixels = _located(rig, camera.name, others, _partners(matches), options)
+    flat = camera.undistorted_pixels(pixels)
+    best = _resected(camera, xyz, flat, options) if len(xyz) >= options.min_points else None
+    if best is None:
+        return None
+    agreeing = int((_errors_px(best, xyz, flat) <= options.max_error_px).sum())
+    return best if agreeing >= max(options.min_points, options.agreeing * len(xyz)) else None
+
+
 def _partners(matches: Sequence[PairMatches]) -> Partners:
     partners: dict[Place, set[Place]] = {}
     for pair in matches:
@@ -130,7 +147,7 @@ def _standing(rig: Rig, name: str, others: Sequence[str], partners: Partners, op
     """None without enough points that one pose explains."""
     camera = rig[name]
     xyz, pixels = _located(rig, name, others, partners, options)
-    flat = camera.plane_from_pixels(pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    flat = camera.undistorted_pixels(pixels)
     while len(xyz) >= options.min_points and (best := _resected(camera, xyz, flat, options)) is not None:
         errors, agrees = _errors_px(camera, xyz, flat), _errors_px(best, xyz, flat) <= options.max_error_px
         turned_deg, shifted = _apart(camera, best, rig)

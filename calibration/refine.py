@@ -49,6 +49,10 @@ class RefineOptions:
     """... and one that turns by more than this"""
     unsure: float = 0.01
     """And one whose place the two halves tell differently by more than twice this share of the radius"""
+    swaying: float = 0.004
+    """And, of a rig that was solved without known lenses, one that goes by more than this share of the radius when
+    lenses are freed (`sway`). The freed ones are off by 0.6 % themselves, so beyond this 1 % is not kept: in
+    "basketball" all 13 cameras off by more than that go by 0.58 % or more"""
 
     def __post_init__(self) -> None:
         if self.least_tracks < 1 or not 0 <= self.level_gain <= self.gain < 1 or self.sure < 0:
@@ -149,6 +153,18 @@ def refine(
     pixels = (best.before_px, best.after_px)
     refined = replace(refined, source=f"{rig.source}; refined ({', '.join(best.kinds)}): {reason}")
     return Refinement(refined, reason, best.kinds, len(sightings.views), gains, pixels, changes)
+
+
+def sway(rig: Rig, evidence: Sequence[PairMatches], *, options: RefineOptions = RefineOptions()) -> dict[str, float]:
+    """How far each camera goes, as a share of the rig's radius, when all that is not known of its lens is freed.
+
+    A mapper keeps principal points in the middle. Lenses that explain the matches as well may have others, and their
+    cameras then stand elsewhere: no more is known of their places.
+    """
+    sightings = _thinned(tracks(rig, evidence), options.most_tracks)
+    freed = aligned(adjust(rig, sightings, LEVELS[-1], options=options.adjust), rig)
+    apart = np.linalg.norm(freed.centres - rig.centres, axis=1) / _radius(rig)
+    return dict(zip(rig.names, apart.tolist(), strict=True))
 
 
 @dataclass(frozen=True)

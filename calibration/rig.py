@@ -169,6 +169,11 @@ class Camera:
         lens = np.asarray(self.distortion, dtype=np.float64)
         return cv2.undistortPoints(plane[:, None], np.eye(3), lens, criteria=stop).reshape(-1, 2)
 
+    def undistorted_pixels(self, pixels: np.ndarray) -> np.ndarray:
+        """Pixels of the distorted picture [N, 2] to those of a pinhole of the same numbers, float64 [N, 2]."""
+        flat: np.ndarray = self.plane_from_pixels(pixels) * (self.fx, self.fy) + (self.cx, self.cy)
+        return flat
+
     def sees(self, points: np.ndarray) -> np.ndarray:
         """Which world points [N, 3] lie before the camera and inside its picture, bool [N]."""
         pixels, depth = self.project(points)

@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,14 @@ from calibration.accept import MatchesReport, MatchOptions, PairMatches, Verdict
 from calibration.exporters import colmap_lens
 from calibration.features import FeatureOptions, Features, detect, match, pairs_by_look
 from calibration.importers import load_rig
-from calibration.rig import Rig
+from calibration.moved import place_by_others
+from calibration.rig import Camera, Rig
 
 _STEERING = ("lens", "shared_lens", "focal_factor", "min_pair_matches", "min_pair_share", "seed", "threads")
+
+
+_LOST = 0.25
+"""Share of the cameras up to which those that the mapper could not place are placed by the others"""
 
 
 class Lens(StrEnum):
@@ -92,15 +97,22 @@ def solve_rig(
     }
     keypoints = {name: _keypoints(shots) for name, shots in features.items()}
     result = _map(instants, keypoints, _matches(features, keypoints, options), options, workspace, lenses)
-    placed = _placed(list(instants), result["registered"], options, workspace)
-    rig = load_rig(workspace / "model", names=placed)
-    report = _judge(rig, keypoints, workspace, options)
-    (workspace / "report.json").write_text(json.dumps({**result, "matches": report.to_json()}, indent=1))
+    names = list(instants)
+    mapped = [name for name in names if name in result["registered"]]
+    if len(mapped) < max(3, (1 - _LOST) * len(names)):
+        _check_placed(names, mapped, options, workspace)
+    matches = _verified(keypoints, workspace)
+    rig, again = _completed(load_rig(workspace / "model", names=mapped), instants, matches, lenses, options)
+    report = _report(rig, matches, options)
+    placed_again = {"placed_by_the_others": again} if again else {}
+    (workspace / "report.json").write_text(
+        json.dumps({**result, **placed_again, "matches": report.to_json()}, indent=1)
+    )
     _check_explained(report, workspace)
-    believed = [name for name in placed if name not in report.bad_cameras]
-    rig = rig.select(_placed(list(instants), believed, options, workspace))
+    _check_placed(names, rig.names, options, workspace)
     count = f"{len(rig.cameras)} of {len(instants)} cameras"
-    return Rig(rig.cameras, f"COLMAP, {count}, {result['reprojection_px']:.2f} px, {report.reason}")
+    others = f", {', '.join(again)} placed by the others" if again else ""
+    return Rig(rig.cameras, f"COLMAP, {count}{others}, {result['reprojection_px']:.2f} px, {report.reason}")
 
 
 def _instants(pictures: Mapping[str, np.ndarray | Sequence[np.ndarray]]) -> dict[str, list[np.ndarray]]:
@@ -220,11 +232,51 @@ def _spec(instants: Mapping[str, Sequence[np.ndarray]], options: SolveOptions, l
     return {"cameras": cameras, **steering}
 
 
-def _placed(names: Sequence[str], found: Sequence[str], options: SolveOptions, workspace: Path) -> list[str]:
-    """The cameras found, in the order of `names`; raises ValueError when they are too few."""
-    placed = [name for name in names if name in found]
+def _completed(
+    rig: Rig,
+    instants: Mapping[str, Sequence[np.ndarray]],
+    matches: Sequence[PairMatches],
+    lenses: Rig | None,
+    options: SolveOptions,
+) -> tuple[Rig, list[str]]:
+    """The mapped rig without the cameras that their matches contradict, but with those that the others then place.
+
+    The mapper takes cameras as they come; a camera with few right matches may meet the wrong ones first. Also returns
+    who was placed so, by name.
+    """
+    bad = _report(rig, matches, options).bad_cameras
+    mapped, rig = rig, rig.select(name for name in rig.names if name not in bad)
+    again = list[str]()
+    lost = [name for name in instants if name not in rig.names]
+    if len(rig.cameras) < 3 or len(lost) > _LOST * len(instants):
+        return rig, again
+    for name in lost:
+        height, width = instants[name][0].shape[:2]
+        guesses = [lenses[name]] if lenses else _guesses(rig, mapped, name, (width, height))
+        for camera in (place_by_others(rig, guess, matches) for guess in guesses):
+            if camera is None:
+                continue
+            more = replace(rig, cameras=(*rig.cameras, camera)).select(n for n in instants if n in {*rig.names, name})
+            if name not in _report(more, matches, options).bad_cameras:
+                rig = more
+                again.append(name)
+                break
+    return rig, again
+
+
+def _guesses(rig: Rig, mapped: Rig, name: str, size: tuple[int, int]) -> list[Camera]:
+    """The camera with the lens that the mapper gave it, or with those of the others, the most usual first."""
+    if name in mapped.names:
+        return [mapped[name]]
+    alike = [camera for camera in rig.cameras if (camera.width, camera.height) == size]
+    usual = float(np.median([camera.fx for camera in alike])) if alike else 0.0
+    return [replace(camera, name=name) for camera in sorted(alike, key=lambda camera: abs(camera.fx - usual))]
+
+
+def _check_placed(names: Sequence[str], placed: Sequence[str], options: SolveOptions, workspace: Path) -> None:
+    """Raise ValueError when too few of the cameras are placed."""
     if len(placed) >= max(2, options.min_registered * len(names)):
-        return placed
+        return
     lost = [name for name in names if name not in placed]
     few = len(lost) <= len(names) // 4
     without = f"to go on without, write ignore = {json.dumps(lost)} into capture.toml; else " if few else ""
@@ -235,16 +287,21 @@ def _placed(names: Sequence[str], found: Sequence[str], options: SolveOptions, w
     )
 
 
-def _judge(rig: Rig, keypoints: Mapping[str, _Keypoints], workspace: Path, options: SolveOptions) -> MatchesReport:
-    """How the solved rig explains the matches that agreed pair by pair."""
+def _verified(keypoints: Mapping[str, _Keypoints], workspace: Path) -> list[PairMatches]:
+    """The matches that agreed pair by pair."""
     names, pixels = list(keypoints), [points.pixels for points in keypoints.values()]
-    evidence = []
+    found = []
     with np.load(workspace / "inliers.npz") as inliers:
         for pair, rows in inliers.items():
             a, b = (int(part) for part in pair.split())
-            if names[a] in rig.names and names[b] in rig.names:
-                evidence.append(PairMatches(names[a], names[b], pixels[a][rows[:, 0]], pixels[b][rows[:, 1]]))
-    return matches_report(rig, evidence, options=options.judge)
+            found.append(PairMatches(names[a], names[b], pixels[a][rows[:, 0]], pixels[b][rows[:, 1]]))
+    return found
+
+
+def _report(rig: Rig, matches: Sequence[PairMatches], options: SolveOptions) -> MatchesReport:
+    """How the rig explains the matches of its cameras."""
+    own = [pair for pair in matches if pair.first in rig.names and pair.second in rig.names]
+    return matches_report(rig, own, options=options.judge)
 
 
 def _check_explained(report: MatchesReport, workspace: Path) -> None:

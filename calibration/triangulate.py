@@ -143,7 +143,7 @@ def verified_matches(
         first, second = pair
         rows, _ = match(features[first], features[second], ratio=ratio)
         a, b = features[first].pixels[rows[:, 0]], features[second].pixels[rows[:, 1]]
-        flat = [_undistorted(rig[name], pixels) for name, pixels in ((first, a), (second, b))]
+        flat = [rig[name].undistorted_pixels(pixels) for name, pixels in ((first, a), (second, b))]
         kept = on_one_geometry(*flat)
         return None if kept is None else PairMatches(first, second, a[kept], b[kept])
 
@@ -197,10 +197,6 @@ def _shared_views(rig: Rig, centre: np.ndarray) -> np.ndarray:
         points = np.concatenate([camera.centre + distance * depth * rays for depth in (0.7, 1.0, 1.5, 2.0)])
         share[row] = [other.sees(points).mean() for other in rig.cameras]
     return np.minimum(share, share.T)
-
-
-def _undistorted(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    return camera.plane_from_pixels(pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
 # Matches and tracks
@@ -335,7 +331,7 @@ def _undistorted_all(rig: Rig, sightings: Sightings) -> np.ndarray:
     flat = np.zeros_like(sightings.pixels)
     for index, camera in enumerate(rig.cameras):
         mine = sightings.camera == index
-        flat[mine] = _undistorted(camera, sightings.pixels[mine])
+        flat[mine] = camera.undistorted_pixels(sightings.pixels[mine])
     return flat.astype(np.float32)
 
 

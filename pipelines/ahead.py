@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from calibration.importers import holds_lenses_alone
 from packuv.lpips import lacking
 from packuv.motion import MotionBackend
 from packuv.progress import Progress, no_progress
@@ -178,7 +179,7 @@ def _fitted_frames(made: Made, store: Store) -> int:
 def _spared(capture: Capture, plan: Plan, options: SequenceOptions) -> Iterator[tuple[str, str]]:
     """Work that the capture or the settings spare."""
     fit = options.fit
-    if capture.calibration is not None:
+    if capture.calibration is not None and not _to_be_solved(capture):
         yield "solving the cameras", f"they are imported from {capture.calibration.name}/, if the pictures confirm them"
     if not options.light.enabled:
         yield "light", "light.enabled is false"
@@ -203,9 +204,15 @@ def _skips(events: Sequence[Event]) -> Iterator[tuple[str, str]]:
     yield from ((event.label, event.reason) for event in events if event.outcome == "skipped")
 
 
+def _to_be_solved(capture: Capture) -> bool:
+    """Whether nothing says where the cameras stand."""
+    return capture.calibration is None or holds_lenses_alone(capture.calibration)
+
+
 def _unknown(capture: Capture, options: SequenceOptions, pilots: bool) -> Iterator[str]:
-    if capture.calibration is None:
-        yield "the cameras have to be solved, which takes minutes to hours more"
+    if _to_be_solved(capture):
+        known = "" if capture.calibration is None else ", of which the lenses alone are known,"
+        yield f"the cameras{known} have to be solved, which takes minutes to hours more"
     if options.motion.backend is MotionBackend.RAFT:
         yield "optical flow by RAFT takes half a second to seconds a picture more without a GPU"
     if pilots:

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from calibration.accept import CheckOptions, MatchOptions, Verdict, check_rig
+from calibration.accept import CheckOptions, MatchOptions, PairMatches, Verdict, check_rig
 from calibration.colour import BalanceOptions, ColourReport, balance, with_colours
 from calibration.held_out import balance_held_out
 from calibration.importers import find_calibration, holds_lenses_alone, load_lenses, load_rig
 from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again, matches_at, mend, refined
-from calibration.refine import LEVELS, PLACES, SOLVED, Refinement, RefineOptions, refine
+from calibration.refine import LEVELS, PLACES, SOLVED, Refinement, RefineOptions, refine, sway
 from calibration.rig import Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
@@ -75,7 +75,7 @@ class PointOptions:
 class ImportRig(Stage):
     """Import the calibration of the capture and judge it by the pictures: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 5
+    name, version = "rig", 6
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -185,7 +185,7 @@ class BorrowRig(Stage):
 class SolveRig(Stage):
     """Solve the rig, from one instant, and from several if that fails: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 2
+    name, version = "rig", 3
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -214,13 +214,20 @@ class SolveRig(Stage):
         rig = max(rigs, key=lambda solved: len(solved.cameras))
         kept = [name for name in self.take.cameras if name in rig.names]
         left = {name: LEFT_OUT for name in self.take.cameras if name not in kept}
-        rig, done = rig.select(kept), None
+        rig, done, swaying = rig.select(kept), None, dict[str, float]()
+        refining = replace(options.refining, adjust=SOLVED)
         if options.refine or lenses is not None:
             work.progress(0, 1, "refining all cameras")
-            done = self._refined(rig, shots)
-        moved = done.told(options.refining) if done else {}
-        evidence = {"source": rig.source, **({"refined": done.to_json()} if done else {})}
-        _save_rig(done.rig if done else rig, options, evidence, work.out, odd={**moved, **left})
+            levels = PLACES if lenses is not None else LEVELS
+            done = refine(rig, self._matches(rig, shots), levels=levels, options=refining)
+        if lenses is None and not (done and done.freed):
+            work.progress(0, 1, "freeing the lenses")
+            swaying = sway(rig, self._matches(rig, shots), options=refining)
+        told = {name: _swaying(share) for name, share in swaying.items() if share > refining.swaying}
+        moved = done.told(refining) if done else {}
+        parts = {"refined": done.to_json() if done else None, "sway": swaying}
+        evidence = {"source": rig.source, **{name: part for name, part in parts.items() if part}}
+        _save_rig(done.rig if done else rig, options, evidence, work.out, odd={**told, **moved, **left})
         return {"source": "COLMAP", **_refined_notes(rig.source, done)}
 
     def _load_lenses(self, footage: Footage, work: Work) -> Rig:
@@ -231,20 +238,21 @@ class SolveRig(Stage):
         sizes = _sizes(footage, footage.filmed(self.first), read_videos(work.path(self.take.groups)))
         return load_lenses(source, self.take.cameras, sizes)
 
-    def _refined(self, rig: Rig, shots: Sequence[Mapping[str, np.ndarray]]) -> Refinement:
-        """By the instants that it was solved from."""
+    def _matches(self, rig: Rig, shots: Sequence[Mapping[str, np.ndarray]]) -> list[PairMatches]:
+        """Of the instants that it was solved from."""
         placed = ({name: shot[name] for name in rig.names} for shot in shots)
-        found = [pair for pairs in matches_at(rig, placed, options=self.options.judge) for pair in pairs]
-        return refine(
-            rig,
-            found,
-            levels=PLACES if self.lenses.sha256 else LEVELS,
-            options=replace(self.options.refining, adjust=SOLVED),
-        )
+        return [pair for pairs in matches_at(rig, placed, options=self.options.judge) for pair in pairs]
 
     def spared(self, folder: Path, notes: Notes) -> Iterator[tuple[str, str]]:
         if "unrefined" in notes:
             yield "refining the cameras", notes["unrefined"]
+
+
+def _swaying(share: float) -> str:
+    return (
+        f"stands where it does only to {share:.1%} of the rig's radius: other lenses explain its matches as well; "
+        "lenses that are known (calibration/intri.yml alone) would tell"
+    )
 
 
 def _refined_notes(verdict: str, done: Refinement | None) -> Notes:

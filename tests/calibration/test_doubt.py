@@ -112,6 +112,18 @@ def test_walls_that_look_alike_accuse_nobody_whom_two_others_confirm(right, evid
     assert named in found(change(right), [*evidence, *alike])
 
 
+def test_a_dozen_chance_matches_at_each_instant_accuse_nobody(right, evidence):
+    """An epipolar geometry of its own explains so many; in small pictures of a crowd they add up over the instants."""
+    rng = np.random.default_rng(0)
+    seen = [pair for pair in evidence if "cam5" not in (pair.first, pair.second)]
+    near = next(pair for pair in evidence if (pair.first, pair.second) == ("cam4", "cam5"))
+    seen.append(replace(near, first_pixels=near.first_pixels[:12], second_pixels=near.second_pixels[:12]))
+    chance = [PairMatches(other, "cam5", *rng.uniform(0, 350, (2, 12, 2))) for other in ("cam0", "cam1")]
+    assert found(right, [*seen, *chance * 3]) == {}  # what stands still is as wrong at every instant
+    change, named = FAULTS["focal length"]
+    assert set(found(change(right), [*evidence, *chance * 3])) == {named}
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_planted_fault_is_named(right, evidence, fault):
     change, named = FAULTS[fault]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calibration.accept import PairMatches
-from calibration.moved import MovedOptions, find_moved
+from calibration.moved import MovedOptions, find_moved, place_by_others
 from calibration.rig import Camera, Rig
 from tests.support.calibration_scene import ring
 
@@ -96,3 +96,28 @@ def test_no_more_than_half_of_the_cameras_have_been_moved():
 def test_options_refuse_what_proves_nothing():
     with pytest.raises(ValueError, match="unusable options"):
         MovedOptions(min_points=4)
+
+
+def test_the_others_place_a_camera_that_stands_nobody_knows_where():
+    rig, lost = ring(6), ring(6).cameras[2]
+    others = rig.select(name for name in rig.names if name != lost.name)
+    found = place_by_others(others, bumped(lost, turn_deg=170, shift=0.9), evidence(rig, chance=20))
+    assert np.linalg.norm(found.centre - lost.centre) < SHIFT * RADIUS
+    turn = cv2.Rodrigues(found.camera_from_world[:3, :3] @ lost.camera_from_world[:3, :3].T)[0]
+    assert np.degrees(np.linalg.norm(turn)) < TURN_DEG
+    assert (found.fx, found.cx, found.name) == (lost.fx, lost.cx, lost.name)
+
+
+def test_points_that_agree_on_no_pose_place_nobody():
+    rig, lost = ring(6), ring(6).cameras[2]
+    others = rig.select(name for name in rig.names if name != lost.name)
+    rng = np.random.default_rng(1)
+    scattered = [
+        replace(pair, **{side: rng.uniform(0, 300, (60, 2))})
+        for pair in evidence(rig)
+        for side in [f"{'first' if pair.first == lost.name else 'second'}_pixels"]
+        if lost.name in (pair.first, pair.second)
+    ]
+    known = [pair for pair in evidence(rig) if lost.name not in (pair.first, pair.second)]
+    assert place_by_others(others, lost, [*known, *scattered]) is None
+    assert place_by_others(others, lost, known) is None

@@ -12,7 +12,7 @@ import pytest
 from calibration.accept import PairMatches
 from calibration.adjust import AdjustOptions
 from calibration.multiview import Sightings, misses_px
-from calibration.refine import PLACES, RefineOptions, aligned, refine, tracks
+from calibration.refine import PLACES, SOLVED, RefineOptions, aligned, refine, sway, tracks
 from calibration.rig import Camera, Rig
 from tests.calibration.test_repair import errors
 from tests.support.calibration_scene import arc
@@ -144,3 +144,13 @@ def test_options_must_make_sense():
         AdjustOptions(shift=0.0)
     with pytest.raises(ValueError, match="gains shares"):
         RefineOptions(gain=0.01, level_gain=0.02)
+
+
+def test_a_rig_whose_principal_points_are_wrong_sways_and_a_right_one_does_not(right):
+    """What a mapper that keeps them in the middle gives, and what `tasks.stages.calibrate` then says."""
+    aside = replace(right, cameras=tuple(replace(c, cx=c.cx + 15 * (-1) ** i) for i, c in enumerate(right.cameras)))
+    options = RefineOptions(adjust=SOLVED)
+    still, swaying = (sway(rig, matches(right), options=options) for rig in (right, aside))
+    assert still.keys() == set(right.names)
+    assert max(still.values()) < max(swaying.values())
+    assert max(swaying.values()) > options.swaying
