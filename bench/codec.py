@@ -40,6 +40,7 @@ from packuv.scene.header import DYNAMIC, KEY
 from packuv.scene.matroska import Encoder, VideoTrack
 from packuv.scene.stream import channel_names, key_rows
 from packuv.score import Artist, spread
+from packuv.threads import ordinary_schedule
 from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
 
 
@@ -225,6 +226,8 @@ def _code(codec: Codec, pictures: Sequence[np.ndarray]) -> tuple[list[bytes], by
     context.pix_fmt, context.time_base = codec.pixels, Fraction(1, 30)
     context.framerate = Fraction(30)
     context.options = dict(codec.options)
+    with ordinary_schedule():
+        context.open(strict=False)
     packets: list[av.Packet[Any]] = []
     for number, picture in enumerate(pictures):
         frame = av.VideoFrame.from_ndarray(_framed(picture, codec.pixels), format=codec.pixels)

@@ -51,6 +51,11 @@ class DoubtOptions:
     """Matches of such a pair that fit, and ..."""
     alibi_fitting: float = 0.5
     """... share of all its matches; those that repeat are among them"""
+    exact: float = 0.5
+    """Share of the limit that the median of a camera's pair lies within, to show that the camera is no more than a
+    little wrong ..."""
+    gross: float = 8.0
+    """... so that two such cameras whose matches miss by this many times the limit matched what only looks alike"""
     better: float = 0.6
     """Share of the median distance that other lenses leave at most, to be believed"""
     noise_px: float = 0.15
@@ -80,7 +85,9 @@ def doubts(
     cleared = _cleared(rig, errors, options)
     known = _confirming_px(errors, judge, options) | _medians_px(errors, options.accusing_matches)
     limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
-    chance = {key for key, px in known.items() if key <= cleared and px > limit}
+    exact = {name for key, px in known.items() if px <= options.exact * limit for name in key}
+    chance = {key for key, px in known.items() if px > limit and key <= cleared}
+    chance |= {key for key, px in known.items() if px > options.gross * limit and key <= exact}
     off, left = _peeled(rig, {key: px for key, px in known.items() if key not in chance}, cleared, options)
     found = {name: f"lies {px:.1f} px off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
              for name, px in off.items()}  # fmt: skip

@@ -49,6 +49,16 @@ class MovedOptions:
     """Median offset of these points from where the rig says, from which on a camera has been moved"""
     over_others: float = 3.0
     """And at least this many times the median of all cameras, for a calibration that is not exact to the pixel"""
+    sure_px: float = 0.7
+    """Offset of a camera whose shift is sure: pictures of 320 pixels show 3 % of the radius by 0.8 to 1.4, and right
+    cameras lie 0.1 to 0.5 off"""
+    sure_points: int = 60
+    """It is by so many points, ..."""
+    sure_shift: float = 0.015
+    """this way at least, as a share of the rig's radius, ..."""
+    sure_left: float = 0.4
+    """and where the other pose leaves at most this share of the offset: 0.15 to 0.3 of a moved camera, nearly all of
+    its neighbours, whose points it misplaces"""
 
     def __post_init__(self) -> None:
         limits = (self.max_error_px, self.located_px, self.offset_px, self.over_others)
@@ -67,6 +77,8 @@ class Standing:
     """Share of them that one pose explains, be it the rig's or another"""
     offset_px: float
     """Median distance of these from where the rig says"""
+    left_px: float
+    """Likewise from where that one pose says"""
     turned_deg: float
     """Between the rig's pose and that one"""
     shifted: float
@@ -140,7 +152,13 @@ def _fitting(standings: Mapping[str, Standing]) -> float:
 
 def _has_moved(standing: Standing, standings: Mapping[str, Standing], options: MovedOptions) -> bool:
     usual = float(np.median([other.offset_px for other in standings.values()])) if standings else 0.0
-    return standing.offset_px > max(options.offset_px, options.over_others * usual)
+    sure = (
+        standing.points >= options.sure_points
+        and standing.shifted >= options.sure_shift
+        and standing.left_px <= options.sure_left * standing.offset_px
+    )
+    limit = options.sure_px if sure else max(options.offset_px, options.over_others * usual)
+    return standing.offset_px > limit
 
 
 def _standing(rig: Rig, name: str, others: Sequence[str], partners: Partners, options: MovedOptions) -> Standing | None:
@@ -149,14 +167,16 @@ def _standing(rig: Rig, name: str, others: Sequence[str], partners: Partners, op
     xyz, pixels = _located(rig, name, others, partners, options)
     flat = camera.undistorted_pixels(pixels)
     while len(xyz) >= options.min_points and (best := _resected(camera, xyz, flat, options)) is not None:
-        errors, agrees = _errors_px(camera, xyz, flat), _errors_px(best, xyz, flat) <= options.max_error_px
+        errors, left = _errors_px(camera, xyz, flat), _errors_px(best, xyz, flat)
+        agrees = left <= options.max_error_px
         turned_deg, shifted = _apart(camera, best, rig)
         if turned_deg <= options.max_turn_deg and shifted <= options.max_shift:
             if agrees.sum() < max(options.min_points, options.agreeing * len(xyz)):
                 return None
             fitting = float((errors <= options.max_error_px).mean())
             offset_px = float(np.median(errors[agrees]))
-            return Standing(len(xyz), fitting, float(agrees.mean()), offset_px, turned_deg, shifted)
+            left_px = float(np.median(left[agrees]))
+            return Standing(len(xyz), fitting, float(agrees.mean()), offset_px, left_px, turned_deg, shifted)
         xyz, flat = xyz[~agrees], flat[~agrees]  # a wall whose pattern repeats elsewhere
     return None
 

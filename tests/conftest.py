@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from signal import SIG_IGN, SIGHUP, SIGINT, getsignal, signal
 
@@ -29,6 +30,13 @@ def pytest_configure() -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     for mark in item.iter_markers("need"):
         need(*mark.args)
+
+
+@pytest.fixture(autouse=True)
+def schedule():
+    """No test leaves real-time priority behind, in which all that is started later would starve the machine."""
+    yield
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER, "an encoder changed how this process is scheduled"
 
 
 @pytest.fixture(scope="session")

@@ -41,6 +41,7 @@ from packuv.progress import Progress, no_progress
 from packuv.scene import Scene, SceneHeader, open_scene
 from packuv.scene.header import codes_digest
 from packuv.scene.matroska import open_matroska
+from packuv.threads import ordinary_schedule
 
 FORMAT, VERSION, ATTACHMENT = "packuv-atlas", 1, "atlas.json"
 EXACT_ALWAYS = (POSITION_HI, POSITION_LO)
@@ -308,6 +309,8 @@ def _write_container(
         streams = {name: _stream(container, name, coder, plan.crop.size, header.rate, base, options) for name in names}
         if document is not None:
             container.add_attachment(ATTACHMENT, "application/json", document)
+        with ordinary_schedule():
+            container.start_encoding()
         for number, (starts, pictures) in enumerate(_drawings(scene, plan, options)):
             for name, picture in pictures.items():
                 frame = _frame(picture, coder)

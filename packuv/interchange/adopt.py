@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from packuv.bounds import MOST_NUMBER
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, SCALE, Codes, Quantizer, attribute_values
 from packuv.gaussians.floats import DRAWN_LOGIT, SH_C0, Gaussians, drawn, opacity, rows_of, with_canonical_axes
 from packuv.gaussians.rows import first_appearance, with_rows
@@ -37,6 +38,8 @@ SEEN = 1 / SH_C0
 """The most that a value beyond the range of its code is wrong to the eye: of SH, from black to white"""
 SEEN_LOG_SCALE = 1.0
 """The same of a log scale"""
+MOST_VALUE = MOST_NUMBER / 10
+"""Of a sound Gaussian: the ranges of codes, which reach a little farther, end at MOST_NUMBER"""
 ANTIALIASED = "antialiased"
 """Field of a header's `extra`: trained with the opacities of Mip-Splatting"""
 ROTATION_REACH = 0.7072
@@ -78,7 +81,7 @@ class AdoptReport:
     gaussians: int
     """Of all frames together, in the files"""
     broken: int
-    """Of these, without a place, size, colour or rotation: what is not finite; they are lost"""
+    """Of these, without a place, size, colour or rotation: what is not finite, or absurd; they are lost"""
     faint: int
     """Of these, fainter than any renderer draws"""
     pruned: int
@@ -168,7 +171,7 @@ def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress:
         faint=survey.faint,
         pruned=wanted - survey.broken - mapper.kept,
         kept_share=mapper.kept / wanted,
-        kept_alpha_share=mapper.kept_alpha / (mapper.alpha + survey.broken_alpha),
+        kept_alpha_share=min(1.0, mapper.kept_alpha / (mapper.alpha + survey.broken_alpha)),
         antialiased=survey.antialiased,
         empty=survey.empty,
         saturated=header.quantizer.saturation(survey.first),
@@ -205,7 +208,7 @@ def read_frame(path: Path, *, sh_degree: int | None) -> Frame:
     """The Gaussians of a file, and the number of those that are not drawn."""
     whole = read_gaussians(path, sh_degree=sh_degree)
     values = (whole.means, whole.log_scales, whole.quaternions, whole.sh)
-    sound = np.logical_and.reduce([np.isfinite(v).all(axis=tuple(range(1, v.ndim))) for v in values])
+    sound = np.logical_and.reduce([(np.abs(v) < MOST_VALUE).all(axis=tuple(range(1, v.ndim))) for v in values])
     sound &= whole.quaternions.any(axis=1) & ~np.isnan(whole.opacity_logits)
     kept, lost = drawn(rows_of(whole, sound)), rows_of(whole, ~sound)
     seen = np.isnan(lost.opacity_logits) | (lost.opacity_logits >= DRAWN_LOGIT)  # what is faint is not missed

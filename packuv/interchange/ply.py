@@ -214,11 +214,14 @@ def _read_rows(path: Path, file: BinaryIO, element: _Element) -> np.ndarray:
     dtype = element.dtype
     if not element.count or not dtype.names:
         return np.zeros(element.count if dtype.names else 0, dtype)
-    lines = [line for line in islice(file, element.count) if line.strip()]
+    lines = _lines(file, element.count)
     try:
         rows = np.loadtxt(lines, np.float64, comments=None, ndmin=2) if lines else np.empty((0, 0))
-    except ValueError as error:
-        raise ValueError(f"{path}: element {element.name} holds no rows of numbers: {error}") from None
+    except ValueError:
+        raise ValueError(
+            f"{path}: element {element.name} must hold {element.count} lines of {len(dtype.names)} numbers, but one of "
+            "them has other words or another number of them; it is damaged or cut short"
+        ) from None
     if rows.shape != (element.count, len(dtype.names)):
         raise ValueError(
             f"{path} is cut short: element {element.name} needs {element.count} lines of {len(dtype.names)} numbers, "
@@ -230,11 +233,15 @@ def _read_rows(path: Path, file: BinaryIO, element: _Element) -> np.ndarray:
     return table
 
 
+def _lines(file: BinaryIO, count: int) -> list[bytes]:
+    """So many lines, or as many as there are; blank ones are none."""
+    return list(islice((line for line in file if line.strip()), count))
+
+
 def _pass_over(path: Path, file: BinaryIO, element: _Element, ascii_rows: bool) -> None:
     """What stands before the Gaussians and is none of them; lists must be of one length, as those of triangles are."""
     if ascii_rows:
-        for _ in islice(file, element.count):
-            pass
+        _lines(file, element.count)
         return
     if not element.count:
         return

@@ -175,7 +175,7 @@ def _sections(path: Path, data: bytes, count: int, level: int) -> Iterator[tuple
                 f"{section.degree} and {section.there} in a section for {section.count}"
             )
         size = section.rows_at + section.row(level).itemsize * section.count
-        if at + size > len(data) or (level and section.bucket_bytes != _CENTRE_BYTES):
+        if at + size > len(data) or (section.buckets and section.bucket_bytes != _CENTRE_BYTES):
             raise ValueError(
                 f"{path} must hold a section of {size} bytes at {at}, but has {len(data)}; it is cut short"
             )
@@ -211,5 +211,5 @@ def _bucket_of(path: Path, section: _Section, lengths: np.ndarray) -> np.ndarray
 def _bands(sh: np.ndarray, degree: int) -> np.ndarray:
     """Bands above 0 [n, coefficients, 3] of values that run band by band, and in a band channel by channel."""
     ends = [3 * ((band + 1) ** 2 - 1) for band in range(degree + 1)]
-    parts = [sh[:, low:high].reshape(len(sh), 3, -1) for low, high in pairwise(ends)]
+    parts = [sh[:, low:high].reshape(len(sh), 3, (high - low) // 3) for low, high in pairwise(ends)]
     return np.concatenate(parts, axis=2).transpose(0, 2, 1)

@@ -122,6 +122,8 @@ def _open(data: bytes) -> tuple[_Header, list[np.ndarray]]:
     packed = data[:2] == GZIP
     unpacker = zlib.decompressobj(wbits=31)
     start = unpacker.decompress(data, HEADER.size) if packed else data
+    if len(start) < HEADER.size:
+        raise ValueError(f"an SPZ file has a header of {HEADER.size} bytes, but this one {len(start)}; it is cut short")
     magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(start)
     if magic == MAGIC and 1 <= version <= 4 and (version == 4) == packed:
         form = "one gzip stream" if version < 4 else "a plain header and streams of zstd"

@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 from packuv import bounds
 from packuv.files import parse_json
-from packuv.scene.matroska import FoundPacket, Reader
+from packuv.scene.matroska import Reader
 
 MAGIC = b"packuv-copy\0\0\0\0\0"
 """The last bytes of a file"""
@@ -25,7 +25,7 @@ VOID = b"\xec\x01"
 """Identifier of the element, and the first of the eight bytes of its size"""
 SEGMENT, _HEAD = b"\x18\x53\x80\x67", 256
 """Identifier of the element that holds all others, and within how many bytes it begins"""
-MOST_TRACKS, MOST_POSITION = 2, 2**62
+MOST_TRACKS = 2
 _END = struct.Struct("<32sQQ16s")
 """SHA-256 of what precedes, bytes of the deflated header and of the deflated places, and the magic"""
 
@@ -34,20 +34,12 @@ _END = struct.Struct("<32sQQ16s")
 class Copy:
     """What the copy says."""
 
-    path: Path
     header: bytes
     """The attachment packuv.json"""
     codec_private: tuple[bytes, ...]
     """Of each track: what its decoder needs"""
     positions: tuple[tuple[int, ...], ...]
     """Of each track's packets: where they begin in the file"""
-
-    def read(self, track: int, number: int, size: int) -> FoundPacket:
-        """The bytes where a packet should be; fewer at the end of a file that is cut short."""
-        position = self.positions[track][number]
-        with self.path.open("rb") as file:
-            file.seek(position)
-            return FoundPacket(file.read(size), position)
 
 
 def append_copy(path: Path, header: bytes) -> None:
@@ -82,37 +74,36 @@ def _grow_segment(file: BinaryIO, count: int) -> None:
     file.write((size + count | 1 << 56).to_bytes(8, "big"))
 
 
-def read_copy(path: Path) -> Copy | None:
-    """The copy, if the file ends with a whole one; raises FileNotFoundError."""
-    with Path(path).open("rb") as file:
-        end = file.seek(0, os.SEEK_END) - _END.size
-        if end < 0:
-            return None
-        file.seek(end)
-        digest, *sizes, magic = _END.unpack(file.read())
-        if magic != MAGIC or sum(sizes) > min(end, 2 * bounds.MOST_JSON_BYTES):
-            return None
-        file.seek(end - sum(sizes))
-        packed = file.read(sum(sizes))
+def read_copy(file: BinaryIO) -> Copy | None:
+    """The copy, if the file ends with a whole one."""
+    end = file.seek(0, os.SEEK_END) - _END.size
+    if end < 0:
+        return None
+    file.seek(end)
+    digest, *sizes, magic = _END.unpack(file.read())
+    if magic != MAGIC or sum(sizes) > min(end, 2 * bounds.MOST_JSON_BYTES):
+        return None
+    file.seek(end - sum(sizes))
+    packed = file.read(sum(sizes))
     if hashlib.sha256(packed).digest() != digest:
         return None
     try:
-        return _decode(Path(path), packed[: sizes[0]], packed[sizes[0] :])
+        return _decode(packed[: sizes[0]], packed[sizes[0] :], end)
     except (ValueError, zlib.error):
         return None
 
 
-def _decode(path: Path, header: bytes, places: bytes) -> Copy:
+def _decode(header: bytes, places: bytes, end: int) -> Copy:
+    """`end`: of the file, beyond which no packet begins."""
     said, what = bounds.fields(parse_json(_unpacked(places), "the places"), "the places"), "the places"
     private = bounds.items(bounds.field(said, "codec_private", what), "codec_private", most=MOST_TRACKS)
     tracks = bounds.items(bounds.field(said, "positions", what), "positions", most=MOST_TRACKS)
     if len(private) != len(tracks):
         raise ValueError(f"there must be a decoder for each track, but there are {len(private)} and {len(tracks)}")
     return Copy(
-        path,
         _unpacked(header),
         tuple(bytes.fromhex(bounds.words(text, "codec_private")) for text in private),
-        tuple(tuple(bounds.wholes(track, "positions", most=MOST_POSITION)) for track in tracks),
+        tuple(tuple(bounds.wholes(track, "positions", most=end)) for track in tracks),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import zlib
 from pathlib import Path
 
@@ -20,12 +21,15 @@ class Source:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._copy = Path(path), read_copy(path)
+        self._path = Path(path)
+        self._file = self._path.open("rb")
+        self._copy = read_copy(self._file)
         self._reader: Reader | None = None
         self.index = self._read_index()
         self._times_ms = self.index.header.times_ms
 
     def close(self) -> None:
+        self._file.close()
         if self._reader:
             self._reader.close()
 
@@ -43,7 +47,8 @@ class Source:
         """
         if self._copy:
             entry = self.index.tracks[track]
-            found = self._copy.read(track, number, entry.sizes[number])
+            position = self._copy.positions[track][number]
+            found = FoundPacket(os.pread(self._file.fileno(), entry.sizes[number], position), position)
             lost = self._reader is None or track >= len(self._reader.tracks)  # a structure that is damaged itself
             if lost or zlib.crc32(found.data) == entry.crc32[number]:
                 return found

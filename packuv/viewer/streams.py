@@ -19,6 +19,7 @@ import numpy as np
 
 from packuv.gaussians.codes import Codes
 from packuv.scene.mosaic import NEUTRAL
+from packuv.threads import ordinary_schedule
 
 TILE = 16
 """Rows fill square tiles of this side; neighbours in a scene's order are neighbours in space"""
@@ -200,6 +201,8 @@ def _encoder(sheet: Sheet, codec: WebCodec, rate: Fraction) -> Any:
     context.time_base, context.framerate = 1 / rate, rate
     context.gop_size = 10_000
     context.options = options
+    with ordinary_schedule():
+        context.open(strict=False)
     return context
 
 

@@ -79,8 +79,8 @@ def _ksplat_section(gaussians, level, bucket, block):
     header = bytearray(1024)
     struct.pack_into("<II", header, 0, count, count)
     struct.pack_into("<H", header, 40, degree)
-    bands = [gaussians.sh[:, low:high].transpose(0, 2, 1).reshape(count, -1) for low, high in ((1, 4), (4, 9), (9, 16))]
-    sh = np.concatenate(bands, axis=1)
+    bands = [gaussians.sh[:, low:high].transpose(0, 2, 1) for low, high in ((1, 4), (4, 9), (9, 16))]
+    sh = np.concatenate([band.reshape(count, 3 * band.shape[2]) for band in bands], axis=1)
     kind = "<f2" if level else "<f4"
     means, before = gaussians.means.astype("<f4"), b""
     if level:
@@ -88,7 +88,7 @@ def _ksplat_section(gaussians, level, bucket, block):
         struct.pack_into("<I", header, 24, 32767)
         struct.pack_into("<II", header, 32, full, int(rest > 0))
         of_row = np.arange(count) // bucket
-        centres = np.stack([gaussians.means[of_row == k].mean(axis=0) for k in range(buckets)])
+        centres = np.array([gaussians.means[of_row == k].mean(axis=0) for k in range(buckets)]).reshape(-1, 3)
         means = np.rint((gaussians.means - centres[of_row]) * (32767 / (block / 2)) + 32767).astype("<u2")
         before = (struct.pack("<I", rest) if rest else b"") + centres.astype("<f4").tobytes()
     coded = np.rint((np.clip(sh, -2.5, 2.5) + 2.5) / 5 * 255).astype(np.uint8) if level == 2 else sh.astype(kind)
@@ -98,5 +98,7 @@ def _ksplat_section(gaussians, level, bucket, block):
         gaussians.quaternions.astype(kind),
         colour_bytes(gaussians),
     ]
-    rows = [np.ascontiguousarray(part).view(np.uint8).reshape(count, -1) for part in (*parts, coded)]
+    rows = [
+        np.frombuffer(part.tobytes(), np.uint8).reshape(count, part.nbytes // max(count, 1)) for part in (*parts, coded)
+    ]
     return bytes(header), before + np.concatenate(rows, axis=1).tobytes()

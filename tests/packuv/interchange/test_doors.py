@@ -82,6 +82,15 @@ def test_what_is_broken_counts_as_lost(tmp_path):
     assert (report.broken, report.faint, report.kept_share) == (10, 4, 86 / 96)
 
 
+@pytest.mark.parametrize("value", [3e38, 1e37, -2e30])
+def test_what_is_absurd_is_broken(tmp_path, value):
+    truth = room(60)
+    truth.opacity_logits[:] = 1
+    truth.means[3, 0] = truth.sh[5, 0, 1] = value
+    write_ply(tmp_path / "a.ply", truth)
+    assert adopt([tmp_path / "a.ply"], tmp_path / "a.mkv", options=SMALL).broken == 2
+
+
 # Strays
 
 
@@ -190,8 +199,14 @@ def test_text_reads_as_the_same_numbers(tmp_path, count, degree, seed):
 def test_text_that_is_cut_short_is_refused(tmp_path):
     as_text(tmp_path / "a.ply", random_gaussians(5, 0))
     lines = (tmp_path / "a.ply").read_text().splitlines()
-    for kept, message in ((-1, "needs 5 lines"), (-5, "needs 5 lines")):
-        (tmp_path / "b.ply").write_text("\n".join(lines[:kept]) + "\n")
+    (tmp_path / "b.ply").write_text("\n".join([*lines[:-2], "", *lines[-2:]]))  # blank lines are none
+    assert len(read_gaussians(tmp_path / "b.ply")) == 5
+    for text, message in (
+        ("\n".join(lines[:-1]), "needs 5 lines"),
+        ("\n".join(lines[:-5]), "needs 5 lines"),
+        ("\n".join(lines)[:-20], "must hold 5 lines"),
+    ):
+        (tmp_path / "b.ply").write_text(text + "\n")
         with pytest.raises(ValueError, match=message):
             read_gaussians(tmp_path / "b.ply")
 
@@ -279,6 +294,16 @@ def test_ksplat_is_read_within_its_steps(tmp_path, count, degree, level, seed):
     (tmp_path / "a.ksplat").write_bytes(content)
     steps = ((0, 1e-6, 0), (1e-4, 1e-3, 2e-3), (1e-4, 1e-3, 2.5 / 255 + 1e-5))[level]
     assert_read(read_gaussians(tmp_path / "a.ksplat"), rows_of(truth, order), *steps)
+
+
+@pytest.mark.parametrize("level", range(3))
+def test_ksplat_may_have_empty_sections(tmp_path, level):
+    truth = random_gaussians(2, 1)
+    content, order = ksplat_bytes(truth, level, sections=3)
+    (tmp_path / "a.ksplat").write_bytes(content)
+    found = read_gaussians(tmp_path / "a.ksplat")
+    assert len(found) == 2
+    assert rotation_error(found, rows_of(truth, order)).max() < 0.02
 
 
 @settings(**HYPOTHESIS)

@@ -99,7 +99,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path, data):
     [
         ((b"ply\n", b"plx\n"), "not a PLY file"),
         ((b"binary_little_endian", b"binary_middle_endian"), "export it as a binary PLY"),
-        ((b"binary_little_endian", b"ascii"), "no rows of numbers"),
+        ((b"binary_little_endian", b"ascii"), "must hold 2 lines of"),
         ((b"float opacity", b"float opacitx"), r"lacks the columns \['opacity'\]"),
         ((b"float f_rest_0", b"float g_rest_0"), "8 columns"),
         ((b"element vertex", b"element point"), "no element vertex"),
@@ -188,9 +188,9 @@ def test_a_compressed_ply_is_read_within_its_own_precision(tmp_path):
 
 
 def in_written_order(gaussians, written):
-    """The rows of `gaussians` as a compressed PLY sorted them: nearest by position."""
-    distance = np.linalg.norm(gaussians.means[None] - written.means[:, None], axis=2)
-    rows = distance.argmin(axis=1)
+    """The rows of `gaussians` as a compressed PLY sorted them: nearest by position and scale."""
+    ours, theirs = (np.concatenate([g.means, g.log_scales], axis=1) for g in (gaussians, written))
+    rows = np.linalg.norm(ours[None] - theirs[:, None], axis=2).argmin(axis=1)
     assert len(set(rows.tolist())) == len(rows)
     return rows_of(gaussians, rows)
 

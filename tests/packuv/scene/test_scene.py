@@ -573,6 +573,11 @@ def test_a_file_cut_at_any_element_says_so_and_gives_what_is_left(scene_file, tm
     assert saved[-1] >= 15
 
 
+def copy_of(path):
+    with path.open("rb") as file:
+        return read_copy(file)
+
+
 def without_copy(content):
     """A file as programs that know nothing of the copy write it."""
     return content[: content.rindex(VOID + b"\0")]
@@ -588,7 +593,7 @@ def test_no_damaged_byte_outside_of_packets_costs_anything(scene_file, tmp_path)
     """Of the file's structure, the header, its checksum, and the copy of it."""
     path, frames = scene_file
     content = path.read_bytes()
-    copy = read_copy(path)
+    copy = copy_of(path)
     free = np.ones(len(content), bool)
     with open_scene(path) as scene:
         for track, places in enumerate(copy.positions):
@@ -604,6 +609,17 @@ def test_no_damaged_byte_outside_of_packets_costs_anything(scene_file, tmp_path)
                 assert same(scene.codes(frame), frames[frame])
 
 
+def test_an_open_scene_reads_on_without_its_name(scene_file, tmp_path, monkeypatch):
+    path, frames = scene_file
+    (tmp_path / "a.mkv").write_bytes(path.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    with open_scene(Path("a.mkv"), threads=1) as scene:
+        assert same(scene.codes(0), frames[0])
+        monkeypatch.chdir("/")
+        (tmp_path / "a.mkv").unlink()
+        assert all(same(scene.codes(frame), frames[frame]) for frame in range(21))
+
+
 def copy_times(copy):
     return json.loads(copy.header)["times_ns"]
 
@@ -617,7 +633,7 @@ def test_a_copy_of_another_scene_or_of_moved_packets_tells_nothing(scene_file, t
     moved = content[:at] + VOID + (100).to_bytes(7, "big") + bytes(100) + content[at:]
     for changed in (content[:at], content[:at] + other, moved):
         assert verify_scene(damaged(scene_file, tmp_path, changed)).ok
-    packed = zlib.compress(read_copy(path).header.replace(b'"30000/1001"', b'"30000/1002"')), zlib.compress(b"{}")
+    packed = zlib.compress(copy_of(path).header.replace(b'"30000/1001"', b'"30000/1002"')), zlib.compress(b"{}")
     append = b"".join(packed)
     end = _END.pack(hashlib.sha256(append).digest(), *map(len, packed), MAGIC)
     assert verify_scene(damaged(scene_file, tmp_path, content[:at] + append + end)).ok
@@ -672,7 +688,7 @@ ODD_VALUES = [None, True, -1, 0, 1, 3, 10**9, 2**70, 0.5, "", "x", [], {}, [1], 
 def parts(scene_file):
     """Header, packets in the order of the file, and tracks."""
     with open_scene(scene_file[0]) as scene:
-        document, times = json.loads(read_copy(scene_file[0]).header), scene.header.times_ms
+        document, times = json.loads(copy_of(scene_file[0]).header), scene.header.times_ms
         packets = [
             Packet(address.track, int(times[address.frame]), 33, scene._source.read(*vars(address).values()).data)
             for address in scene._wanted(0, 0, 20)
