@@ -125,12 +125,12 @@ def _keep(place: Path, heard: Ltc, notes: Sequence[str]) -> None:
 def _hear(path: Path, pts_ns: np.ndarray) -> Heard:
     places, unread = _look(path)
     if not places:
-        return None, tuple(f"{place} carries LTC, but is too distorted to be read; it is not used" for place in unread)
+        return None, tuple(map(_distorted, unread))
     first, *others = places
     heard = [decode_ltc(samples[first.channel], start) for start, samples in first.track.blocks(BLOCK_S, RATE)]
     labels = _joined([found for found in heard if found])
     if labels is None:
-        return None, (f"{first} carries LTC, but is too distorted to be read; it is not used",)
+        return None, (_distorted(first),)
     rate = _rate(labels)
     if rate is None:
         per_second = 1 / float(np.median(np.diff(labels.begins_s)))
@@ -138,8 +138,12 @@ def _hear(path: Path, pts_ns: np.ndarray) -> Heard:
         return None, (f"{odd}: is the sample rate in the file's header right? it is not used",)
     told = _of_frames(labels, rate, pts_ns)
     if told is None:
-        return None, (f"{first} carries LTC, but is too distorted to be read; it is not used",)
+        return None, (_distorted(first),)
     return told, tuple(_place_notes(first, others))
+
+
+def _distorted(place: object) -> str:
+    return f"{place} carries LTC, but is too distorted to be read; it is not used"
 
 
 @dataclass(frozen=True)

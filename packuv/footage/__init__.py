@@ -3,7 +3,7 @@
 from packuv.footage.damage import DamageLog, damage_told, without
 from packuv.footage.lens import LensCamera
 from packuv.footage.light import Light, LightOptions, measure_light
-from packuv.footage.masks import MaskReader, Silhouettes, foreground
+from packuv.footage.masks import MaskReader, Silhouettes, foreground, laid_over
 from packuv.footage.planes import as_planes
 from packuv.footage.reader import FrameReader
 from packuv.footage.response import Response
@@ -27,6 +27,7 @@ __all__ = [
     "as_planes",
     "damage_told",
     "foreground",
+    "laid_over",
     "looks_like_log",
     "measure_light",
     "without",

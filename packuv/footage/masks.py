@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from packuv.footage.lens import LensCamera
 from packuv.footage.pictures import picture_names
 from packuv.footage.reader import FrameReader
 from packuv.footage.views import Views
@@ -62,6 +63,14 @@ class MaskReader(FrameReader):
 def foreground(pixels: np.ndarray) -> np.ndarray:
     """bool [H, W] of a mask as `Views` undistort and scale it, uint8 [H, W, 3]: at least half of the pixel."""
     return np.asarray(pixels[:, :, 0] >= HALF)
+
+
+def laid_over(
+    masks: Mapping[str, Path], frames: np.ndarray, lenses: Sequence[LensCamera], *, max_width: int | None
+) -> Views:
+    """Masks of these cameras as `Views` give their pictures, of which arguments are the same."""
+    sizes = {lens.pinhole.name: (lens.pinhole.width, lens.pinhole.height) for lens in lenses}
+    return Views(masks, frames, lenses, max_width=max_width, reader=MaskReader(masks, sizes))
 
 
 class Silhouettes:

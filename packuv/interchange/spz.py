@@ -26,6 +26,8 @@ from packuv.interchange.conventions import alpha_codes, drop_largest, logits_of_
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
+START_BYTES = 4096
+"""Of a file, in which its header is"""
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams (version 4)."""
 V4_HEADER_BYTES, V4_ENTRY = 32, struct.Struct("<QQ")
@@ -95,10 +97,10 @@ def read_spz(path: Path) -> Gaussians:
 
 def antialiased(path: Path) -> bool:
     """Whether an SPZ file is marked as trained with the opacities of Mip-Splatting; a file that is none is not."""
-    data = Path(path).read_bytes()
+    with Path(path).open("rb") as file:
+        data = file.read(START_BYTES)
     try:
-        start = zlib.decompressobj(wbits=31).decompress(data, HEADER.size) if data[:2] == GZIP else data
-        return bool(HEADER.unpack_from(start)[5] & ANTIALIASED)
+        return bool(HEADER.unpack_from(_start(data)[0])[5] & ANTIALIASED)
     except (zlib.error, struct.error):
         return False
 
@@ -119,9 +121,8 @@ class _Header:
 
 def _open(data: bytes) -> tuple[_Header, list[np.ndarray]]:
     """Header, and the streams as bytes."""
+    start, unpacker = _start(data)
     packed = data[:2] == GZIP
-    unpacker = zlib.decompressobj(wbits=31)
-    start = unpacker.decompress(data, HEADER.size) if packed else data
     if len(start) < HEADER.size:
         raise ValueError(f"an SPZ file has a header of {HEADER.size} bytes, but this one {len(start)}; it is cut short")
     magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(start)
@@ -143,6 +144,12 @@ def _open(data: bytes) -> tuple[_Header, list[np.ndarray]]:
     if version == 4:
         return header, _zstd_streams(data, header, streams)
     return header, _cut(_unpacked(unpacker, size), header)
+
+
+def _start(data: bytes) -> tuple[bytes, Any]:
+    """The header with what follows it, and what unpacks the rest of a file that is one gzip stream."""
+    unpacker = zlib.decompressobj(wbits=31)
+    return (unpacker.decompress(data, HEADER.size) if data[:2] == GZIP else data), unpacker
 
 
 def _unpacked(unpacker: Any, size: int) -> bytes:

@@ -27,31 +27,34 @@ def export_frames(arguments: argparse.Namespace) -> int:
     Such files know no light: each frame goes out as it is seen in its own.
     """
     from packuv.files import whole_folder
-    from packuv.gaussians.floats import drawn, lit_gaussians
-    from packuv.interchange import write_gaussians
-    from packuv.interchange.adopt import ANTIALIASED
     from packuv.scene import open_scene
 
     kind = _splat_format(arguments.format, arguments.output)
     with open_scene(arguments.scene) as scene:
-        smooth = scene.header.extra.get(ANTIALIASED) is True
         if arguments.frame is not None:
             check_frame(len(scene), arguments.frame)
-            gaussians = lit_gaussians(scene.gaussians(arguments.frame), scene.light(arguments.frame))
-            count = write_gaussians(arguments.output, gaussians, kind=kind, antialiased=smooth)
-            lost = len(drawn(gaussians)) - count
-            print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}{_far_text(lost)}")
+            count, far = _export_frame(scene, arguments.frame, arguments.output, kind)
+            print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}{_far_text(far)}")
             return 0
-        frames = frames_of(len(scene), arguments.frames)
-        lost = 0
+        frames, left = frames_of(len(scene), arguments.frames), 0
         with whole_folder(arguments.output) as folder, shown(arguments, "export") as progress:
             for done, frame in enumerate(frames, start=1):
-                gaussians = lit_gaussians(scene.gaussians(frame), scene.light(frame))
-                path = folder / f"{frame:06d}{kind.suffix}"
-                lost += len(drawn(gaussians)) - write_gaussians(path, gaussians, kind=kind, antialiased=smooth)
+                left += _export_frame(scene, frame, folder / f"{frame:06d}{kind.suffix}", kind)[1]
                 progress(done, len(frames))
-    print(f"{arguments.output}: {len(frames)} files, frames {frames.start} to {frames.stop - 1}{_far_text(lost)}")
+    print(f"{arguments.output}: {len(frames)} files, frames {frames.start} to {frames.stop - 1}{_far_text(left)}")
     return 0
+
+
+def _export_frame(scene: Scene, frame: int, path: Path, kind: SplatFormat) -> tuple[int, int]:
+    """How many Gaussians are in the file, and how many that are drawn are not."""
+    from packuv.gaussians.floats import drawn, lit_gaussians
+    from packuv.interchange import write_gaussians
+    from packuv.interchange.adopt import ANTIALIASED
+
+    gaussians = lit_gaussians(scene.gaussians(frame), scene.light(frame))
+    smooth = scene.header.extra.get(ANTIALIASED) is True
+    count = write_gaussians(path, gaussians, kind=kind, antialiased=smooth)
+    return count, len(drawn(gaussians)) - count
 
 
 def _far_text(count: int) -> str:

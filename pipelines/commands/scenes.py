@@ -227,15 +227,9 @@ def _scores_text(facts: Mapping[str, Any]) -> str:
     lines = [f"{'camera':<12}" + "".join(f"{text:>22}" for text in kinds.values())]
     for name, means in rows.items():
         lines.append(f"{name:<12}" + "".join(f"{_score_text(means, kind):>22}" for kind in kinds))
-    lines += ["", f"{'calibrated':<12}" + "".join(f"{text:>16}" for text in _APART)]
-    for name, means in rows.items():
-        lines.append(f"{name:<12}" + "".join(f"{_figure(means[key], how):>16}" for key, how in _APART.values()))
+    lines += _figures_text("calibrated", rows, _APART)
     if "psnr_foreground_db" in facts["mean"]:
-        lines += ["", f"{'foreground':<12}" + "".join(f"{text:>16}" for text in _FOREGROUND)]
-        for name, means in rows.items():
-            lines.append(
-                f"{name:<12}" + "".join(f"{_figure(means[key], how):>16}" for key, how in _FOREGROUND.values())
-            )
+        lines += _figures_text("foreground", rows, _FOREGROUND)
     for name, why in facts.get("doubtful_masks", {}).items():
         lines.append(f"masks of {name} are not used: {why}")
     what = "held out, never fitted" if facts["held_out"] else "not all held out"
@@ -259,6 +253,16 @@ _FOREGROUND = {
     "LPIPS": ("lpips_foreground", ".4f"),
     "share": ("foreground_share", ".3f"),
 }
+
+
+def _figures_text(
+    head: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, tuple[str, str]]
+) -> list[str]:
+    """A table, after a line of nothing."""
+    lines = ["", f"{head:<12}" + "".join(f"{text:>16}" for text in columns)]
+    for name, means in rows.items():
+        lines.append(f"{name:<12}" + "".join(f"{_figure(means[key], how):>16}" for key, how in columns.values()))
+    return lines
 
 
 def _figure(value: float | None, how: str) -> str:

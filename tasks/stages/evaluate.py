@@ -14,7 +14,7 @@ import numpy as np
 
 from packuv.bounds import MOST_CAMERAS, MOST_NS, MOST_SIDE_PX, field, fields, items, whole
 from packuv.files import save_json
-from packuv.footage import LensCamera, Light, MaskReader, Silhouettes, Transfer, Views
+from packuv.footage import LensCamera, Light, Silhouettes, Transfer, Views, laid_over
 from packuv.footage.light import unpacked
 from packuv.lpips import Lpips, lacking
 from packuv.motion import MotionOptions, measure_motion
@@ -136,10 +136,8 @@ def _silhouettes(capture: Path, views: Views) -> tuple[Silhouettes | None, dict[
     if not masks:
         return None, {}
     columns = [views.names.index(name) for name in masks]
-    sizes = {name: (views.lenses[column].pinhole.width, views.lenses[column].pinhole.height)
-             for name, column in zip(masks, columns, strict=True)}  # fmt: skip
-    laid = Views(masks, views.frames[:, columns], [views.lenses[column] for column in columns],
-                 max_width=views.max_width, reader=MaskReader(masks, sizes))  # fmt: skip
+    lenses = [views.lenses[column] for column in columns]
+    laid = laid_over(masks, views.frames[:, columns], lenses, max_width=views.max_width)
     with tempfile.TemporaryDirectory() as folder:
         cache = measure_motion(views, Path(folder), MotionOptions(keep_flow=False))
         agreed = {name: asdict(compare_masks(laid, cache, place)) for place, name in enumerate(masks)}

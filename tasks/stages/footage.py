@@ -19,11 +19,11 @@ from packuv.footage import (
     FrameReader,
     LensCamera,
     Light,
-    MaskReader,
     Silhouettes,
     Transfer,
     Views,
     WatchingReader,
+    laid_over,
     looks_like_log,
     without,
 )
@@ -184,10 +184,9 @@ class Footage:
         `open_views` gives; see `packuv.footage.foreground`."""
         rig, groups, found = self.load_rig(), self.load_groups(), find_masks(find_capture(self.site.capture))
         masks = {name: found[name] for name in self.take.cameras if name in files.sha256}
-        sizes = {name: (rig[name].width, rig[name].height) for name in masks}
         frames = groups.frames[:, [groups.cameras.index(name) for name in masks]]
         lenses = [lens_camera(rig[name]) for name in masks]
-        return Views(masks, frames, lenses, max_width=self.take.pictures.max_width, reader=MaskReader(masks, sizes))
+        return laid_over(masks, frames, lenses, max_width=self.take.pictures.max_width)
 
     def filmed(self, instant: int) -> dict[str, np.ndarray]:
         """Pictures as filmed, uint8 [H, W, 3] RGB, of the cameras that have one at this instant of the take."""
