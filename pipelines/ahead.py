@@ -25,7 +25,7 @@ from pipelines.request import STAGES, RunRequest
 from pipelines.space import check_room, missing_bytes, size_found
 from pipelines.stages import Made
 from pipelines.stages import Sequence as Stages
-from sync.capture import Capture
+from sync.capture import Capture, find_masks
 from tasks.artefacts.digests import Signature
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.store import Store
@@ -147,9 +147,9 @@ class _Unread(Originals):
 def _size(request: RunRequest, capture: Capture, plan: Plan, root: Path, progress: Progress) -> Size:
     """How much there is to process, of frames that are matched as the run would match them, unless it did already."""
     matching = replace(request, stop_after="sync", max_minutes=None, target_psnr=None)
-    made = walk(matching, (), Journal())[0].get("sync") if root.is_dir() else None
-    if made is not None:
-        return size_found(Store(root).path(made), plan)
+    made = walk(matching, (), Journal())[0] if root.is_dir() else Made()
+    if (groups := made.get("sync")) and (made.get("mask_files") or not find_masks(capture)):
+        return size_found(Store(root).path(groups), plan)
     jobs, options = jobs_of(request), options_of(request, capture, request.preset)
     with TemporaryDirectory(prefix="packuv-plan-") as folder:
         originals = _Unread(capture, Path(folder) / "file_digests.json")
