@@ -200,7 +200,8 @@ def _spared(capture: Capture, plan: Plan, options: SequenceOptions, size: Size) 
     if capture.settings.rig_from:
         yield "solving the cameras", f"their rig is that of {capture.settings.rig_from}"
     elif capture.calibration is not None and not size.solved:
-        yield "solving the cameras", f"they are imported from {capture.calibration.name}/, if the pictures confirm them"
+        given = capture.calibration.name + "/" * capture.calibration.is_dir()
+        yield "solving the cameras", f"they are imported from {given}, if the pictures confirm them"
     if not options.light.enabled:
         yield "light", "light.enabled is false"
     if not fit.background.instants:
