@@ -227,6 +227,11 @@ def test_masks_that_come_later_redo_what_they_are_used_for_and_doubtful_ones_not
     assert 0 < scores["foreground_share"] < 0.5
     assert scores["psnr_foreground_db"] > 5
 
+    afresh = tmp_path / "afresh"
+    assert main(["run", str(capture), *words(afresh, "--direct")[5:]]) == OK
+    assert made_in(afresh) == masked
+    assert next(afresh.glob("*/scene.mkv")).read_bytes() == next(out.glob("*/scene.mkv")).read_bytes()
+
     shutil.rmtree(capture / "masks")
     assert main(asked) == OK
     assert made_in(out) == plain
