@@ -21,7 +21,7 @@ from sync.chapters import unjoined
 from sync.clock import ClockMode
 from sync.natural import natural_key
 from sync.offsets import MOST_OFFSET_S, find_offsets, offset_notes, read_offsets
-from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
+from sync.pictures import PICTURE_SUFFIXES, Pictures, holds_pictures, is_picture, list_pictures
 from sync.probe import VideoInfo, container_timecodes, probe_video
 from sync.timecode import NANOSECONDS, SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
 
@@ -237,8 +237,8 @@ def find_masks(capture: Capture) -> dict[str, Path]:
         raise ValueError(f"{inside} must be a folder that holds masks as {wanted}, but is none; rename it")
     if loose := sorted((path.name for path in inside.iterdir() if is_picture(path.name)), key=natural_key):
         raise ValueError(
-            f"{inside} must hold masks as {wanted}, but {loose[0]} lies in no camera's folder, as do {len(loose) - 1} "
-            "more; move those of each camera into a folder with its name"
+            f"{inside} must hold masks as {wanted}, but pictures lie in no camera's folder: {len(loose)}, the first of "
+            f"them {loose[0]}; move those of each camera into a folder with its name"
         )
     found, ignored = _by_camera(inside, _cameras(inside)), capture.settings.ignore
     folders = [path for path in inside.iterdir() if path.is_dir() and not path.name.startswith(".")]
@@ -264,8 +264,8 @@ def check_masks(capture: Capture, camera: str) -> tuple[int, int]:
     count = len(masks) if masks else probe_video(path, listen=False).frame_count
     if count != info.frame_count:
         raise ValueError(
-            f"{path} must have a mask for each of the {info.frame_count} frames of {camera}, but has {count}; add "
-            "those that are missing, or take it out"
+            f"{path} must have a mask for each of the {info.frame_count} frames of {camera}, but has {count}"
+            f"{_without_number(masks)}; add those that are missing, or take it out"
         )
     if masks and video.is_dir() and not np.array_equal(masks.numbers, wanted := list_pictures(video).numbers):
         odd = int(np.flatnonzero(masks.numbers != wanted)[0])
@@ -274,6 +274,10 @@ def check_masks(capture: Capture, camera: str) -> tuple[int, int]:
             f"{wanted[odd]} and mask {masks.numbers[odd]}; number them alike"
         )
     return info.width, info.height
+
+
+def _without_number(masks: Pictures | None) -> str:
+    return f", and {masks.others[0]} without a number" if masks and masks.others else ""
 
 
 def probe_capture(

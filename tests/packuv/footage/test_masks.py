@@ -46,6 +46,10 @@ def test_masks_belong_to_cameras_and_frames(tmp_path: Path) -> None:
     capture = find_capture(tmp_path)
     with pytest.raises(ValueError, match="a mask for each of the 3 frames of a, but has 2"):
         check_masks(capture, "a")
+    (masks / "last.png").write_bytes((masks / "000001.png").read_bytes())
+    with pytest.raises(ValueError, match=r"but has 2, and last\.png without a number; add"):
+        check_masks(capture, "a")
+    (masks / "last.png").unlink()
     (masks / "000002.png").touch()
     with pytest.raises(ValueError, match=r"000002\.png is an empty file, but must hold a mask"):
         check_masks(capture, "a")
@@ -62,7 +66,10 @@ def test_masks_belong_to_cameras_and_frames(tmp_path: Path) -> None:
     [
         (lambda masks: (masks / "b").mkdir(), r"b must hold numbered masks, as 000000\.png, but holds none"),
         (lambda masks: shutil.copytree(masks / "a", masks / "c"), "c belongs to no video"),
-        (lambda masks: shutil.move(masks / "a" / "000002.png", masks), r"000002\.png lies in no camera's folder"),
+        (
+            lambda masks: shutil.move(masks / "a" / "000002.png", masks),
+            r"no camera's folder: 1, the first of them 000002\.png",
+        ),
         (lambda masks: masks.rename(masks.with_name("kept")).with_name("masks").touch(), "masks must be a folder"),
         (lambda masks: shutil.rmtree(masks / "a"), "must hold masks as <camera>/000000"),
     ],
