@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from packuv.camera import PinholeCamera
+    from packuv.scene.verify import VerifyReport
 
 MOST_STARTS = 16
 """First frames of segments that `packuv info` names"""
@@ -142,10 +143,17 @@ def _verify_scene(arguments: argparse.Namespace) -> int:
     with shown(arguments, "verify") as progress:
         report = verify_scene(arguments.scene, progress=progress)
     facts = {**vars(report), "ok": report.ok}
-    good = f"{arguments.scene}: all {report.frames} frames decode to exactly what was written"
-    bad = f"{arguments.scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
-    print_facts(facts, arguments.json, lambda _: good if report.ok else bad)
+    print_facts(facts, arguments.json, lambda _: "\n".join(_verify_lines(arguments.scene, report)))
     return 0 if report.ok else 1
+
+
+def _verify_lines(scene: Path, report: VerifyReport) -> Iterator[str]:
+    if report.header:
+        yield f"damaged    {report.header}"
+    if report.bad:
+        yield f"{scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
+    else:
+        yield f"{scene}: all {report.frames} frames decode to exactly what was written"
 
 
 def _verify_store(arguments: argparse.Namespace) -> int:
