@@ -30,6 +30,8 @@ FIGURES = {
     "foreground_ssim": "SSIM of the foreground",
     "foreground_lpips": "LPIPS of the foreground",
     "ssim": "SSIM",
+    "fitted_psnr_db": "PSNR of fitted cameras, dB",
+    "fitted_gap_db": "fitted above unseen cameras, dB",
     "tof_px": "tOF, px",
     "flicker": "flicker",
     "lpips": "LPIPS",
@@ -84,7 +86,7 @@ class Difference:
     """Something in which two runs differ; None where a run lacks it."""
 
     kind: str
-    """setting, version, figure, camera or finding"""
+    """setting, version, stage version, figure, camera or finding"""
     name: str
     a: Any
     b: Any
@@ -108,9 +110,11 @@ def read_report(path: Path) -> dict[str, Any]:
 
 
 def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[Difference]:
-    """What differs between two reports: settings, versions, figures, cameras' scores, findings; in this order."""
+    """What differs between two reports: settings, versions, of stages too, figures, cameras' scores, findings; in this
+    order."""
     for kind, name in (("setting", "options"), ("version", "versions")):
         yield from _fields(kind, _flat(a["run"][name] or {}), _flat(b["run"][name] or {}))
+    yield from _fields("stage version", *(report["run"].get("stage_versions", {}) for report in (a, b)))
     figures = [{told: report["summary"].get(name) for name, told in FIGURES.items()} for report in (a, b)]
     yield from _fields("figure", *figures)
     yield from _fields("camera", _levels(a), _levels(b))

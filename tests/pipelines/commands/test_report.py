@@ -34,12 +34,15 @@ def test_two_runs_differ_in_what_was_set_what_came_and_what_is_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a = write_run(tmp_path / "a", 25.0)
-    b = write_run(tmp_path / "b", 18.5, options={"fit": {"iterations": 90}}, seconds=6.0)
+    b = write_run(
+        tmp_path / "b", 18.5, options={"fit": {"iterations": 90}}, seconds=6.0, stage_versions={"background": 9}
+    )
     assert main(["report", "--compare", str(a), str(b), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["differences"]
     told = {item["name"]: (item["a"], item["b"]) for item in found}
     assert told["fit.iterations"] == (900, 90)
     assert told["PSNR, dB"] == told["PSNR of cam1, dB"] == (25.0, 18.5)
+    assert told["background"] == (None, 9)
     assert told["total time, s"] == (60.0, 6.0)
     assert next(item["b"] for item in found if item["kind"] == "finding").startswith("The mean of 18.5 dB")
     one, two = (json.loads((folder / "report.json").read_text()) for folder in (a, b))
