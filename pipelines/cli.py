@@ -574,6 +574,7 @@ def _report(command: argparse.ArgumentParser) -> None:
         "--compare", type=Path, nargs=2, default=None, metavar=("A", "B"), help="what differs between two runs"
     )
     command.add_argument("--dataset", type=Path, default=None, metavar="DIR", help="all runs of an output folder")
+    command.add_argument("-o", "--output", type=Path, metavar="PAGE", help="the comparison as a page, too")
     _set(command, "a limit of the report, as report.psnr_db=25")
     _json(command)
 
