@@ -12,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -93,6 +93,7 @@ PART = 256
 AHEAD = 2
 """Drawn pictures that may wait for each worker"""
 
+Item = TypeVar("Item")
 Measure = Callable[[np.ndarray, np.ndarray], float]
 """Of a picture and its truth, float32 [3, H, W], sRGB"""
 
@@ -395,6 +396,33 @@ def _level(squared: np.ndarray) -> float | None:
     return decibels(mean) if mean else None
 
 
+@dataclass(frozen=True)
+class Likeness:
+    """How close one picture, rendered as the camera would film it, is to its truth."""
+
+    camera: str
+    frame: int
+    psnr_calibrated_db: float | None
+    """dB; None where the two are equal"""
+    ssim_calibrated: float
+
+
+def glance(scene: Scene, views: Views, frames: Sequence[int], progress: Progress) -> list[Likeness]:
+    """The likeness of a few frames on all cameras of the views, without what needs the frame before. A camera without
+    a picture at an instant is not scored there."""
+    artist, found = Artist(scene), list[Likeness]()
+    for done, frame in enumerate(frames, start=1):
+        gaussians = scene.gaussians(frame)
+        for camera, name in enumerate(views.names):
+            pixels = views.pixels(camera, frame, remember=False)
+            if pixels is not None:
+                shown = views.response(camera, frame).shown(artist.draw(gaussians, views.cameras[camera]))
+                level, alike = likenesses([shown], as_planes(pixels))[0]
+                found.append(Likeness(name, frame, level if math.isfinite(level) else None, alike))
+        progress(done, len(frames), "fitted cameras")
+    return found
+
+
 def segment_starts(scene: Scene) -> list[int]:
     """First frames of the segments after the first one."""
     return [entry.first for entry in scene.index.segments[1:]]
@@ -518,7 +546,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def spread(names: Sequence[str], count: int) -> tuple[str, ...]:
+def spread(names: Sequence[Item], count: int) -> tuple[Item, ...]:
     """`count` of the names at equal distances; all of them if there are fewer.
 
     >>> spread(["a", "b", "c", "d", "e", "f"], 3)

@@ -575,13 +575,15 @@ def _report(command: argparse.ArgumentParser) -> None:
         "--compare", type=Path, nargs=2, default=None, metavar=("A", "B"), help="what differs between two runs"
     )
     command.add_argument("--dataset", type=Path, default=None, metavar="DIR", help="all runs of an output folder")
+    command.add_argument("-o", "--output", type=Path, metavar="PAGE", help="the comparison as a page, too")
     _set(command, "a limit of the report, as report.psnr_db=25")
     _json(command)
 
 
 def _view(command: argparse.ArgumentParser) -> None:
     _scene(command)
-    command.add_argument("--port", type=int, default=8787, help="TCP port on localhost; 0 picks a free one")
+    command.add_argument("--port", type=int, default=8787, help="TCP port; 0 picks a free one")
+    command.add_argument("--host", default="127.0.0.1", help="address to answer at; 0.0.0.0 shows it to everyone")
 
 
 def _uv_map(command: argparse.ArgumentParser) -> None:

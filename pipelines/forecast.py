@@ -21,6 +21,7 @@ from pipelines.probe import CAMERAS, INSTANTS, REFERENCE, Look, Probe, look, rem
 from pipelines.request import STAGES
 from sync.capture import Capture, find_lender, probe_capture
 from tasks.artefacts.jobs import Jobs
+from tasks.stages.evaluate import GLANCE_FRAMES
 from tasks.stages.footage import PictureOptions
 from tasks.stages.plan import Plan
 
@@ -262,6 +263,7 @@ def work_of(size: Size, options: SequenceOptions, probe: Probe) -> dict[str, flo
     fit, frames = options.fit, size.frames
     filmed = sum(width * height for width, height in size.fitted + size.held_out) / 1e6
     fitted, scored = (_mpx(sides, options) for sides in (size.fitted, size.held_out or size.fitted[:3]))
+    beside = _mpx(size.fitted[: options.evaluate.fitted_cameras], options) if size.held_out else 0.0
     gaussians, segments = fit.density.cap / 1e6, _segments(size)
     return {
         "sync": frames * (len(size.fitted) + len(size.held_out)),
@@ -278,7 +280,7 @@ def work_of(size: Size, options: SequenceOptions, probe: Probe) -> dict[str, flo
         "frame iterations": frames * expected_iterations(options) * active,
         "encode": frames * gaussians,
         "verify": frames * gaussians,
-        "scores": frames * scored,
+        "scores": frames * scored + min(frames, GLANCE_FRAMES) * beside,
     }
 
 

@@ -132,6 +132,9 @@ def _quality(figures: Mapping[str, Any]) -> Iterator[str]:
         cameras = ", ".join(figures["scored_cameras"])
         unseen = "never fitted" if figures["held_out"] else "fitted"
         yield f"quality    {figures['psnr_db']:.2f} dB, SSIM {figures['ssim']:.4f} on {cameras} ({unseen})"
+    if figures["fitted_psnr_db"] is not None:
+        cameras, gap = ", ".join(figures["fitted_cameras"]), figures["fitted_gap_db"]
+        yield f"fitted     {figures['fitted_psnr_db']:.2f} dB on {cameras}, {gap:+.2f} dB against unseen cameras"
     if figures["mb_per_30_frames"] is not None:
         yield f"size       {figures['mb_per_30_frames']:.2f} MB per 30 frames"
 

@@ -15,6 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 
 import packuv
@@ -22,8 +23,10 @@ from calibration.accept import RigReport
 from calibration.colour import ColourModel
 from calibration.rig import Rig
 from calibration.triangulate import SparsePoints, reprojections_px
+from packuv.files import load_json
 from packuv.footage import Light, damage_told
 from packuv.scene import open_scene
+from packuv.scene.header import VERSION as SCENE_VERSION
 from packuv.score import read_table
 from pipelines.events import Event, Journal
 from pipelines.forecast import Forecast
@@ -34,7 +37,7 @@ from sync.align import SyncReport
 from sync.content import Content
 from tasks.artefacts.jobs import CancelledError
 from tasks.artefacts.recipe import plain, restore
-from tasks.artefacts.store import Key, Store
+from tasks.artefacts.store import Key, Receipt, Store
 from tasks.artefacts.workshop import Workshop
 from tasks.report.facts import (
     CameraEvidence,
@@ -51,11 +54,12 @@ from tasks.report.facts import (
     by_camera,
     scene_figures,
 )
+from tasks.report.record import SCHEMA
 from tasks.report.write import JSON_NAME, PAGE_NAME
 from tasks.stages.calibrate import CHECK, COLOUR, POINTS
 from tasks.stages.content import read_content
 from tasks.stages.encode import SCENE
-from tasks.stages.evaluate import PICTURES, TABLE, frame_scores
+from tasks.stages.evaluate import METRICS, PICTURES, TABLE, fitted_scores, frame_scores
 from tasks.stages.fitting import REFUSED
 from tasks.stages.footage import LIGHT, RIG
 from tasks.stages.light import read_damage, read_steady
@@ -208,10 +212,12 @@ PACKAGES = (
     "numpy",
     "numba",
     "av",
-    "opencv-python-headless",
+    "opencv-contrib-python-headless",
+    "pyarrow",
     "pycolmap",
     "prefect",
     "numba-cuda",
+    "gsplat",
 )
 """Whose versions may change results, or how long they take"""
 
@@ -222,7 +228,8 @@ def versions() -> dict[str, str]:
     for name in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
-    return found
+    found["ffmpeg in av"] = av.ffmpeg_version_info
+    return {**found, "scene file": str(SCENE_VERSION), "report.json": str(SCHEMA)}
 
 
 def remains_in(folder: Path) -> Remains:
@@ -282,13 +289,15 @@ def event_of(stage: Mapping[str, Any]) -> Event:
 
 def collect(run: Remains) -> ReportInput:
     """What the stages left, for the report; parts that the run did not come to are missing."""
-    scores = _scores(run.folder("evaluate"))
+    scores, receipts = _scores(run.folder("evaluate")), _receipts(run)
     rig_folder, sync_folder = run.folder("points") or run.folder("rig"), run.folder("sync")
     return ReportInput(
         name=run.name,
         command=run.command,
         options=run.options,
         versions=run.versions,
+        stage_versions={receipt.recipe["stage"]: receipt.recipe["version"] for receipt in receipts},
+        otherwise=_otherwise(run, receipts),
         host=run.host,
         finished=run.finished,
         seconds=run.seconds,
@@ -306,12 +315,35 @@ def collect(run: Remains) -> ReportInput:
         light=_light(run.folder("light")),
         motion=_curve(run),
         scores=scores,
+        fitted=_fitted(run.folder("evaluate")),
         scene=_scene(run),
         pictures=tuple(_pictures(run.folder("evaluate"))),
         stages=tuple(_stage(run.store, event) for event in run.events),
-        forecast=tuple(_compared(run)),
+        forecast=tuple(_compared(run, receipts)),
         choice=run.choice and replace(run.choice, minutes=run.seconds / 60, psnr_db=_level(scores)),
     )
+
+
+def _receipts(run: Remains) -> list[Receipt]:
+    """Of all that the run is made of, whoever made it, in order of making."""
+    return [
+        run.store.receipt(key)
+        for keys in run.made.keys.values()
+        for key in keys
+        if run.store.holds(key)  # what another take lends lies in a store of its own
+    ]
+
+
+def _otherwise(run: Remains, receipts: Sequence[Receipt]) -> dict[str, tuple[str, ...]]:
+    """What was made by other software than this run's, or by another processor than the last artefact, by how."""
+    found: dict[str, dict[str, None]] = {}
+    for receipt in receipts:
+        for name, used in receipt.versions.items():
+            if (now := run.versions.get(name, used)) != used:
+                found.setdefault(f"{name} {used}, not {now}", {})[receipt.recipe["stage"]] = None
+        if receipt.cpu and receipts[-1].cpu not in ("", receipt.cpu):
+            found.setdefault(f"another processor, {receipt.cpu}", {})[receipt.recipe["stage"]] = None
+    return {how: tuple(stages) for how, stages in found.items()}
 
 
 GROUPS = {
@@ -324,17 +356,12 @@ GROUPS = {
 """Stage that each kind of artefact belongs to"""
 
 
-def _compared(run: Remains) -> Iterator[Compared]:
+def _compared(run: Remains, made: Sequence[Receipt]) -> Iterator[Compared]:
     """What was forecast beside what came. Times of stages are work: sums over what the run is made of, whoever made it.
     The total is that of the run from start to end, and what a run that reused nothing would have done beside."""
     if run.forecast is None:
         return
-    receipts = [
-        (key.stage, run.store.receipt(key))
-        for keys in run.made.keys.values()
-        for key in keys
-        if run.store.holds(key)  # what another take lends lies in a store of its own
-    ]
+    receipts = [(receipt.recipe["stage"], receipt) for receipt in made]
     for stage, seconds in run.forecast.seconds.items():
         took = [receipt.seconds for name, receipt in receipts if GROUPS[name] == stage]
         yield Compared(stage, "min", seconds / 60, sum(took) / 60 if took else None)
@@ -438,6 +465,10 @@ def _curve(run: Remains) -> MotionCurve | None:
 
 def _scores(folder: Path | None) -> tuple[FrameScore, ...]:
     return frame_scores(read_table(folder / TABLE)) if folder else ()
+
+
+def _fitted(folder: Path | None) -> tuple[FrameScore, ...]:
+    return fitted_scores(load_json(folder / METRICS)) if folder else ()
 
 
 def _scene(run: Remains) -> SceneFigures | None:

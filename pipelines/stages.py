@@ -31,7 +31,7 @@ from tasks.stages.calibrate import FindPoints, ImportRig, SolveRig, borrow_rig, 
 from tasks.stages.clock import find_starts
 from tasks.stages.content import CompareContent
 from tasks.stages.encode import Encode, Verify
-from tasks.stages.evaluate import Evaluate, scored_cameras
+from tasks.stages.evaluate import Evaluate, cameras_beside, scored_cameras
 from tasks.stages.fitting import (
     FitBackdrop,
     PatchBackdrop,
@@ -365,9 +365,10 @@ class Sequence:
     def _evaluation(self, take: Take) -> Evaluate:
         """With LPIPS, where the file of weights and the package for it are there."""
         scene, named = self.made.only("encode"), self.options.evaluate.lpips_weights
+        beside = cameras_beside(self.placed, self.options.evaluate)
         weights = Path(named).resolve() if named else None
         why = lacking(weights)
         if why or weights is None:
-            return Evaluate(take=take, scene=scene, no_lpips=why)
+            return Evaluate(take=take, beside=beside, scene=scene, no_lpips=why)
         backbone = self.workshop.files({"backbone": weights}, "evaluate")
-        return Evaluate(take=take, scene=scene, backbone=backbone, weights=str(weights))
+        return Evaluate(take=take, beside=beside, scene=scene, backbone=backbone, weights=str(weights))

@@ -40,7 +40,7 @@ LABELS_APART = 1.5
 BEGUN_APART_S, CLOCKS_SET_S = 1.5, 3600
 """Seconds that creation_time, which counts whole ones, must lie apart to mean something, and at most, or a clock is not
 set"""
-SHARED_TIMECODES = "timestamps.csv"
+SHARED_TIMECODES, SHARED_SUFFIXES = "timestamps.csv", (".csv", ".tsv")
 SETTINGS = "capture.toml"
 MASKS = "masks"
 """Folder of foreground masks"""
@@ -683,8 +683,14 @@ def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]
             f"timecodes are read from files that end in {', '.join(SUFFIXES)}, but {unread[0]} does not; rename it, "
             "convert it, or take it out of the folder"
         )
-    shared = [path for path in files if path.name == SHARED_TIMECODES and path.stem not in videos]
-    if shared and len(files) == 1:
+    alone = len(files) == 1
+    shared = [
+        path
+        for path in files
+        if path.stem not in videos
+        and (path.name == SHARED_TIMECODES or (alone and path.suffix.lower() in SHARED_SUFFIXES))
+    ]
+    if shared and alone:
         return dict.fromkeys(videos, shared[0])
     if shared:
         others = [path.name for path in files if path not in shared]

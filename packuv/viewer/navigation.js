@@ -12,6 +12,7 @@ function turn(v, axis, angle) { // Rodrigues
   return v.map((value, k) => c * value + s * side[k] + along * axis[k]);
 }
 
+const OPTICS = ["fx", "fy", "cx", "cy", "width", "height"];
 const JUMP_MS = 400;
 const POLE = 0.06; // closest the view comes to straight up or down, radians
 const FLY_KEYS = { KeyW: [2, 1], KeyS: [2, -1], KeyD: [0, 1], KeyA: [0, -1], KeyQ: ["up", -1], KeyE: ["up", 1] };
@@ -51,7 +52,8 @@ export class Navigation {
     this.moveTo(target, animate);
   }
 
-  stateOf({ camera_from_world: pose, ...optics }) {
+  stateOf({ camera_from_world: pose, ...camera }) {
+    const optics = Object.fromEntries(OPTICS.map((name) => [name, camera[name]]));
     const axes = pose.slice(0, 3).map((row) => row.slice(0, 3));
     const eye = [0, 1, 2].map((k) => -(axes[0][k] * pose[0][3] + axes[1][k] * pose[1][3] + axes[2][k] * pose[2][3]));
     const ahead = dot(axes[2], add(this.world.centre, eye, -1)); // turn about the point of the gaze nearest the centre
@@ -63,12 +65,50 @@ export class Navigation {
     this.moveTo(this.home, true);
   }
 
-  // Look at the point that lies `depth` ahead under a pixel.
-  focus(x, y, depth) {
+  // The view in numbers, for links: eye, forward, down, distance of what it turns about, optics.
+  numbers() {
+    const { eye, axes, distance, optics } = this.state;
+    return [...eye, ...axes[2], ...axes[1], distance, ...OPTICS.map((name) => optics[name])];
+  }
+
+  // The view that `numbers` tells; false for numbers that tell none.
+  recall(numbers) {
+    const [forward, down, distance, optics] = [numbers.slice(3, 6), numbers.slice(6, 9), numbers[9], numbers.slice(10)];
+    const sound = numbers.length === 16 && numbers.every(Number.isFinite) && Math.hypot(...cross(down, forward)) > 0
+      && distance > 0 && [0, 1, 4, 5].every((k) => optics[k] > 0);
+    if (!sound) return false;
+    this.exact = null;
+    const named = Object.fromEntries(OPTICS.map((name, k) => [name, optics[k]]));
+    this.moveTo({ eye: numbers.slice(0, 3), axes: facing(unit(forward), down), distance, optics: named }, false);
+    return true;
+  }
+
+  // The view as a camera of the scene's own form.
+  camera() {
+    const { axes, eye, optics } = this.state;
+    const pose = axes.map((axis) => [...axis, -dot(axis, eye)]);
+    return { ...optics, camera_from_world: [...pose, [0, 0, 0, 1]] };
+  }
+
+  // The point that lies `depth` ahead under a pixel of the canvas, and the other way about.
+  pointAt(x, y, depth) {
     const { lens } = this.view();
     const { axes, eye } = this.state;
     const local = [((x - lens[2]) / lens[0]) * depth, ((y - lens[3]) / lens[1]) * depth, depth];
-    const point = local.reduce((sum, value, k) => add(sum, axes[k], value), eye);
+    return local.reduce((sum, value, k) => add(sum, axes[k], value), eye);
+  }
+
+  pixelOf(point) { // null behind the near plane
+    const { lens, near } = this.view();
+    const local = this.state.axes.map((axis) => dot(axis, add(point, this.state.eye, -1)));
+    if (local[2] <= near) return null;
+    return [(lens[0] * local[0]) / local[2] + lens[2], (lens[1] * local[1]) / local[2] + lens[3]];
+  }
+
+  // Look at the point that lies `depth` ahead under a pixel.
+  focus(x, y, depth) {
+    const { axes, eye } = this.state;
+    const point = this.pointAt(x, y, depth);
     const forward = unit(add(point, eye, -1));
     this.exact = null;
     this.moveTo({ ...this.state, axes: facing(forward, axes[1]), distance: Math.hypot(...add(point, eye, -1)) }, true);

@@ -6,10 +6,12 @@ from another origin.
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import sys
 import threading
+import time
 import webbrowser
 import zlib
 from collections.abc import Callable
@@ -52,20 +54,32 @@ def serve(
     port: int = 0,
     open_browser: bool = False,
     announce: Callable[[str], object] | None = None,
+    worst: int | None = None,
 ) -> None:
     """Show a scene file in the browser until interrupted.
 
-    Port 0 takes any free port. `announce` gets the address once it answers; by default it is printed. Raises
-    FileNotFoundError for a missing file, ValueError for one that is no scene, OSError where the port is taken.
+    Port 0 takes any free port. `announce` gets the address once it answers; by default it is printed. `worst` is a
+    frame to mark as the one with the lowest score. Raises FileNotFoundError for a missing file, ValueError for one
+    that is no scene, or where the port or the host cannot be had.
     """
     if not 0 <= port < 2**16:
         raise ValueError(f"a port is a number from 0 to {2**16 - 1}, but is {port}")
-    with open_source(scene_path) as source, ViewerServer((host, port), source) as server:
+    with open_source(scene_path) as source, _server(host, port, source, worst) as server:
         announce(server.url) if announce else print(server.url, flush=True)
         if open_browser:
             webbrowser.open(server.url)
         with suppress(KeyboardInterrupt):
             server.serve_forever()
+
+
+def _server(host: str, port: int, source: Source, worst: int | None) -> ViewerServer:
+    try:
+        return ViewerServer((host, port), source, worst=worst)
+    except OSError as error:
+        why, cure = error.strerror or str(error), "name another --port, or 0 for a free one"
+        if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+            cure = "--host must be an address of this machine, such as 0.0.0.0 for all"
+        raise ValueError(f"port {port} of {host} cannot be had: {why}; {cure}") from None
 
 
 class ViewerServer(ThreadingHTTPServer):
@@ -74,9 +88,9 @@ class ViewerServer(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS
 
-    def __init__(self, address: tuple[str, int], source: Source) -> None:
+    def __init__(self, address: tuple[str, int], source: Source, *, worst: int | None = None) -> None:
         super().__init__(address, _Handler)
-        self.source = source
+        self.source, self.worst = source, worst
         self.reading = threading.Lock()  # decoders keep state
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.tables = lru_cache(maxsize=1)(lambda: tables_bytes(source.quantizer))
@@ -114,7 +128,8 @@ class ViewerServer(ThreadingHTTPServer):
             name, kind = PAGES[path]
             return Path(__file__).with_name(name).read_bytes(), kind
         if path == "/scene.json":
-            return json.dumps(describe(self.source)).encode(), "application/json"
+            marked = {} if self.worst is None else {"worst": self.worst}
+            return json.dumps({**describe(self.source), **marked}).encode(), "application/json"
         if path == "/tables.bin":
             return self.tables(), BINARY
         numbered = NUMBERED.fullmatch(path)
@@ -134,6 +149,8 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = PATIENCE_SECONDS
     protocol_version = "HTTP/1.1"
     server_version = "packuv"
+    _decode_ms: float | None = None
+    """That the answer took to be found"""
 
     def do_GET(self) -> None:
         self._answer(with_body=True)
@@ -147,7 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, *, with_body: bool) -> None:
         if self._is_rebound():
             return self._send(HTTPStatus.FORBIDDEN, b"this viewer answers to localhost only\n", "text/plain", with_body)
-        path = self.path.partition("?")[0]
+        path, started = self.path.partition("?")[0], time.perf_counter()
         try:
             found = self.server.content(path)
         except Exception as error:  # a damaged file must reach the page as words, not as a dropped connection
@@ -157,6 +174,7 @@ class _Handler(BaseHTTPRequestHandler):
             return self._send(status, message, "text/plain; charset=utf-8", with_body)
         if found is None:
             return self._send(HTTPStatus.NOT_FOUND, b"nothing here\n", "text/plain; charset=utf-8", with_body)
+        self._decode_ms = 1000 * (time.perf_counter() - started)
         self._send(HTTPStatus.OK, *found, with_body)
 
     def _is_rebound(self) -> bool:
@@ -173,6 +191,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(body)))
         if deflate:
             self.send_header("Content-Encoding", "deflate")
+        if self._decode_ms is not None:
+            self.send_header("Server-Timing", f"decode;dur={self._decode_ms:.1f}")
         self.send_header("Vary", "Accept-Encoding")
         self.send_header("Cache-Control", "no-cache")
         self.send_header("Content-Security-Policy", POLICY)

@@ -73,6 +73,10 @@ class Source(Protocol):
         """Where up is, world, a unit vector; None to derive it from the cameras."""
 
     @property
+    def metric(self) -> bool:
+        """Whether a world unit is a metre."""
+
+    @property
     def segments(self) -> tuple[range, ...]:
         """Frames of each segment without a gap; the first of each is its keyframe."""
 
@@ -98,6 +102,7 @@ class SegmentSource:
     held_out: frozenset[str] = field(default=frozenset())
     near: float | None = None
     up: tuple[float, float, float] | None = None
+    metric: bool = False
 
     def __post_init__(self) -> None:
         if not self.parts:
@@ -145,6 +150,7 @@ class SceneSource:
         self.quantizer, self.cameras, self.held_out = header.quantizer, header.cameras, frozenset(header.held_out)
         self.near: float | None = header.extra.get("near")
         self.up = header.up
+        self.metric = header.extra.get("metric") is True
         self.segments = tuple(range(entry.first, entry.first + entry.frames) for entry in scene.index.segments)
         self._keys: OrderedDict[int, Codes] = OrderedDict()
         self._moving: OrderedDict[int, Codes] = OrderedDict()
@@ -210,6 +216,7 @@ def describe(source: Source) -> dict[str, Any]:
         "columns": attribute_count(quantizer.sh_degree),
         "centre": quantizer.centre.tolist(),
         "near": near_plane(source),
+        "metric": source.metric,
         "segments": [{"first": frames.start, "length": len(frames)} for frames in source.segments],
         "cameras": [{**camera.to_json(), "held_out": camera.name in source.held_out} for camera in source.cameras],
         **({"light": source.light.tolist()} if source.light.any() else {}),

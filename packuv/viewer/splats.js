@@ -4,7 +4,7 @@
 
 const WIDTH = 1024; // slots per texture row, as in worker.js
 const BATCH = 2048; // quads per instance: one quad each would leave most of a GPU idle
-export const MODES = ["colour", "depth", "dynamic"];
+export const MODES = ["colour", "depth", "dynamic", "opacity", "map"];
 export const DEPTH_STOPS = [ // near to far, of even steps in lightness
   [253, 231, 37], [122, 209, 81], [34, 168, 132], [42, 120, 142], [65, 68, 135], [46, 16, 62],
 ];
@@ -22,7 +22,8 @@ uniform vec3 eye;
 uniform vec4 lens; // fx fy cx cy, px
 uniform vec2 size;
 uniform float near, scale;
-uniform int layers, degree, mode, moving;
+uniform vec3 centre; // of the UV map
+uniform int layers, degree, bands, mode, moving; // bands: bit l draws band l
 layout(location = 0) out uvec4 shape; // centre and longer axis, px
 layout(location = 1) out uvec4 look;  // shorter axis, red green, blue alpha, depth
 
@@ -39,16 +40,17 @@ float value(int column) {
 vec3 coefficient(int k) { return vec3(value(7 + 3 * k), value(8 + 3 * k), value(9 + 3 * k)); }
 
 vec3 colour(vec3 d) {
-  vec3 c = 0.5 + 0.28209479177387814 * coefficient(0);
-  if (degree > 0) {
+  vec3 c = vec3(0.5);
+  if ((bands & 1) != 0) c += 0.28209479177387814 * coefficient(0);
+  if (degree > 0 && (bands & 2) != 0) {
     c += 0.4886025119029199 * (-d.y * coefficient(1) + d.z * coefficient(2) - d.x * coefficient(3));
   }
-  if (degree > 1) {
+  if (degree > 1 && (bands & 12) != 0) {
     float xx = d.x * d.x, yy = d.y * d.y, zz = d.z * d.z;
-    c += 1.0925484305920792 * (d.x * d.y * coefficient(4) - d.y * d.z * coefficient(5) - d.x * d.z * coefficient(7))
+    if ((bands & 4) != 0) c += 1.0925484305920792 * (d.x * d.y * coefficient(4) - d.y * d.z * coefficient(5) - d.x * d.z * coefficient(7))
        + 0.31539156525252005 * (2.0 * zz - xx - yy) * coefficient(6)
        + 0.5462742152960396 * (xx - yy) * coefficient(8);
-    if (degree > 2) {
+    if (degree > 2 && (bands & 8) != 0) {
       c += -0.5900435899266435 * (d.y * (3.0 * xx - yy) * coefficient(9) + d.x * (xx - 3.0 * yy) * coefficient(15))
          + 2.890611442640554 * d.x * d.y * d.z * coefficient(10)
          - 0.4570457994644658 * (4.0 * zz - xx - yy) * (d.y * coefficient(11) + d.x * coefficient(13))
@@ -57,6 +59,14 @@ vec3 colour(vec3 d) {
     }
   }
   return max(c, 0.0);
+}
+
+// Where in the UV map: hue along u, from bright to dark along v, and every sixteenth of either set off.
+vec3 mapped(vec3 p) {
+  vec2 uv = vec2(atan(p.y, p.x) / 6.283185307179586 + 0.5, acos(clamp(p.z / length(p), -1.0, 1.0)) / 3.141592653589793);
+  vec3 hue = clamp(abs(mod(6.0 * uv.x + vec3(0.0, 4.0, 2.0), 6.0) - 3.0) - 1.0, 0.0, 1.0);
+  vec2 cell = floor(uv * vec2(16.0));
+  return mix(vec3(1.0), hue, 0.75) * (1.0 - 0.7 * uv.y) * (mod(cell.x + cell.y, 2.0) < 0.5 ? 1.0 : 0.82);
 }
 
 mat3 turned(vec3 v) {
@@ -100,6 +110,8 @@ void main() {
     bool moves = at.y * ${WIDTH} + at.x < moving;
     rgb = moves ? vec3(1.0, 0.45, 0.08) * (0.35 + 0.65 * grey) : vec3(0.06 + 0.3 * grey);
   }
+  if (mode == 3) rgb = vec3(alpha);
+  if (mode == 4) rgb = mapped(world - centre);
   shape = floatBitsToUint(vec4(lens.xy * ratio + lens.zw, longer * axis));
   uint blueAlpha = packHalf2x16(vec2(rgb.z, alpha));
   look = uvec4(floatBitsToUint(shorter), packHalf2x16(rgb.xy), blueAlpha, floatBitsToUint(local.z));
@@ -212,6 +224,9 @@ export class SplatView {
     gl.bindVertexArray(this.wires);
     attribute(gl, this.lines, "point", this.points, 0);
     attribute(gl, this.lines, "tint", this.points, 12);
+    this.timer = gl.getExtension("EXT_disjoint_timer_query_webgl2"); // which many browsers do not offer
+    this.query = null;
+    this.gpu_ms = null; // of the last picture whose time is known
     this.frame = gl.createFramebuffer();
     this.projected = gl.createFramebuffer();
     this.slotRows = 0;
@@ -220,8 +235,9 @@ export class SplatView {
     this.size = [0, 0];
   }
 
-  setTables(tables, layers, degree) {
+  setTables(tables, layers, { sh_degree: degree, centre }) {
     const { gl } = this;
+    this.centre = centre;
     this.layers = layers;
     this.degree = degree;
     this.tables = texture(gl, gl.TEXTURE_2D);
@@ -262,9 +278,10 @@ export class SplatView {
   }
 
   // view: {rotation (row-major camera_from_world), eye, lens [fx fy cx cy] px, near}
-  // look: {mode, scale, background [3], range [2], light [3], lines}
+  // look: {mode, bands, scale, background [3], range [2], light [3], lines}
   draw(view, look) {
     const { gl } = this;
+    const timed = this.startTimer();
     this.accumulate(view, look, MODES.indexOf(look.mode));
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.useProgram(this.show.handle);
@@ -279,6 +296,22 @@ export class SplatView {
     gl.uniform3fv(uniforms.stops, DEPTH_STOPS.flat().map((byte) => byte / 255));
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     if (look.lines && this.pointCount) this.drawLines(view);
+    if (timed) gl.endQuery(this.timer.TIME_ELAPSED_EXT);
+  }
+
+  // One query at a time: a new one once the last one has told its time.
+  startTimer() {
+    const { gl, timer } = this;
+    if (!timer) return false;
+    if (this.query) {
+      if (!gl.getQueryParameter(this.query, gl.QUERY_RESULT_AVAILABLE)) return false;
+      const sound = !gl.getParameter(timer.GPU_DISJOINT_EXT);
+      if (sound) this.gpu_ms = gl.getQueryParameter(this.query, gl.QUERY_RESULT) / 1e6;
+      gl.deleteQuery(this.query);
+    }
+    this.query = gl.createQuery();
+    gl.beginQuery(timer.TIME_ELAPSED_EXT, this.query);
+    return true;
   }
 
   // Mean depth at a canvas pixel, or null where nothing is.
@@ -329,6 +362,8 @@ export class SplatView {
     gl.uniform1f(uniforms.scale, look.scale);
     gl.uniform1i(uniforms.layers, this.layers);
     gl.uniform1i(uniforms.degree, this.degree);
+    gl.uniform1i(uniforms.bands, look.bands);
+    gl.uniform3fv(uniforms.centre, this.centre);
     gl.uniform1i(uniforms.mode, mode);
     gl.uniform1i(uniforms.moving, this.moving);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -12,11 +12,14 @@ const at = (id) => document.getElementById(id);
 const canvas = at("picture");
 const wish = new URLSearchParams(location.hash.slice(1)); // frame, camera, mode, play=0, scale, background, bare=1
 
-const look = { mode: "colour", scale: 1, background: [0, 0, 0], range: [1, 2], light: [1, 1, 1], lines: false };
+const look = { mode: "colour", bands: 15, scale: 1, background: [0, 0, 0], range: [1, 2], light: [1, 1, 1], lines: false };
 const player = {
-  frame: 0, shown: -1, playing: wish.get("play") !== "0", loops: true, speed: 1, due: 0, stalled: false, stalledAt: 0,
+  frame: 0, step: 1, ends: "loop", shown: -1, playing: wish.get("play") !== "0", speed: 1, due: 0,
+  stalled: false, stalledAt: 0, stalls: 0,
 };
-const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "" };
+const ENDS = { loop: "Loop", bounce: "Ping-pong", stop: "Once" }; // what happens at the last frame
+const ruler = { on: false, points: [] }; // world
+const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
 const meter = { drawn: 0, frames: 0, since: performance.now(), sort_ms: 0, count: 0, moving: 0, seen: new Set() };
 let scene = null, world = null, frameCount = 0, rate = 30, keyframes = new Set();
 let waiting = false, stale = true, dirty = true, spare = null, previous = performance.now();
@@ -35,7 +38,7 @@ const receive = {
     rate = scene.rate[0] / scene.rate[1];
     frameCount = scene.segments.reduce((sum, { length }) => sum + length, 0);
     keyframes = new Set(scene.segments.map(({ first }) => first));
-    splats.setTables(message.tables, message.layers, scene.sh_degree);
+    splats.setTables(message.tables, message.layers, scene);
     world = worldOf(scene);
     navigation.setWorld(world);
     splats.setLines(frusta(scene, world));
@@ -57,7 +60,8 @@ const receive = {
     if (message.frame !== player.shown) meter.frames++;
     player.shown = message.frame;
     look.light = (scene.light?.[message.frame] ?? [0, 0, 0]).map((log) => Math.exp(log / GAMMA));
-    Object.assign(meter, { count: message.count, moving: message.moving, sort_ms: message.sort_ms });
+    const { count, moving, sort_ms, visible, traffic } = message;
+    Object.assign(meter, { count, moving, sort_ms, visible, traffic });
     dirty = true;
   },
   lost({ count, text }) {
@@ -68,6 +72,7 @@ const receive = {
   },
   problem({ text }) {
     buffer.trouble = text;
+    if (!text) buffer.closed = false;
     notice("");
   },
 };
@@ -81,7 +86,8 @@ function ask() {
 }
 
 function tellPlayhead() {
-  worker.postMessage({ type: "playhead", frame: player.frame, loops: player.loops });
+  const { frame, step, ends } = player;
+  worker.postMessage({ type: "playhead", frame, step, ends });
 }
 
 // Depth colours follow the view, but slowly while it plays, or they would flicker.
@@ -100,12 +106,12 @@ function advance(seconds) {
   player.due += seconds * player.speed;
   let moved = 0;
   for (; moved < frameCount; moved++) {
-    const next = following(player.frame);
+    const next = following(player);
     if (next === null) return pause();
     if (player.due < shownFor(player.frame)) break;
-    if (!buffer.map[next]) { stall(); break; }
+    if (!buffer.map[next.frame]) { stall(); break; }
     player.due -= shownFor(player.frame);
-    player.frame = next;
+    Object.assign(player, next);
   }
   if (moved) { stale = true; tellPlayhead(); showClock(); }
 }
@@ -115,13 +121,17 @@ function shownFor(frame) { // seconds; frames need not be evenly spaced
   return (next - scene.times_ns[frame]) / 1e9;
 }
 
-function following(frame) {
-  if (frame + 1 < frameCount) return frame + 1;
-  return player.loops && frameCount > 1 ? 0 : null;
+function following({ frame, step }) { // frame and direction; null at the end
+  const there = (number) => number >= 0 && number < frameCount;
+  if (frameCount < 2) return null;
+  if (player.ends === "bounce" && !there(frame + step)) step = -step;
+  if (there(frame + step)) return { frame: frame + step, step };
+  return player.ends === "loop" ? { frame: 0, step } : null;
 }
 
 function stall() {
   player.stalled = true;
+  player.stalls++;
   player.stalledAt = performance.now();
   player.due = 0;
   tellPlayhead();
@@ -130,11 +140,11 @@ function stall() {
 function mayResume() {
   if (performance.now() - player.stalledAt > STALL_NOTICE_MS && at("wait").hidden) notice("Loading frames…");
   const enough = buffer.trouble ? 1 : Math.min(buffer.ahead - 1, Math.ceil(RESUME_SECONDS * rate * player.speed));
-  let next = player.frame;
-  for (let step = 0; step < enough; step++) {
+  let next = player;
+  for (let left = enough; left > 0; left--) {
     next = following(next);
     if (next === null) return true;
-    if (!buffer.map[next]) return false;
+    if (!buffer.map[next.frame]) return false;
   }
   return true;
 }
@@ -150,7 +160,7 @@ function seek(frame) {
 function pause() { setPlaying(false); }
 
 function setPlaying(playing) {
-  if (playing && following(player.frame) === null) seek(0);
+  if (playing && following(player) === null) seek(0);
   Object.assign(player, { playing, due: 0, stalled: false });
   notice("");
   at("play").textContent = playing ? "Pause" : "Play";
@@ -173,8 +183,11 @@ function tick(now) {
 function drawPicture() {
   dirty = false;
   const view = navigation.view();
+  const started = performance.now();
   splats.draw(view, look);
+  meter.submit_ms = performance.now() - started;
   meter.drawn++;
+  drawRuler();
   outline(view.frame);
   showLegend();
   if (player.shown >= 0) document.documentElement.dataset.frame = player.shown; // for automation
@@ -217,12 +230,17 @@ function drawMarks() {
   }
   pen.fillStyle = "#ffffffb0";
   for (const frame of keyframes) pen.fillRect(Math.min(frame * step, marks.width - 1.5), 0, 1.5, 10);
+  if (scene.worst === undefined) return;
+  pen.fillStyle = "#ff9d3b";
+  pen.fillRect(Math.min(scene.worst * step, marks.width - 3), 0, 3, 10);
 }
 
 // ---- words
 
 function showClock() {
-  const key = buffer.map[player.frame] === LOST ? " · lost" : keyframes.has(player.frame) ? " · keyframe" : "";
+  const { frame } = player;
+  const said = [[buffer.map[frame] === LOST, "lost"], [keyframes.has(frame), "keyframe"], [frame === scene.worst, "worst"]];
+  const key = said.filter(([is]) => is).map(([, word]) => ` · ${word}`).join("");
   const seconds = (scene.times_ns[player.frame] / 1e9).toFixed(3);
   at("clock").innerHTML = `<b>${player.frame}</b> / ${frameCount - 1} · ${seconds} s${key}`;
   at("scrub").value = player.frame;
@@ -235,7 +253,26 @@ function showSpeeds(now) {
   const drawn = meter.drawn ? `${(meter.drawn / seconds).toFixed(meter.drawn < 5 ? 1 : 0)} fps` : "still";
   const played = player.playing ? ` · ${(meter.frames / seconds).toFixed(1)} of ${rate.toFixed(0)} frames/s` : "";
   at("speeds").textContent = `${drawn}${played} · sort ${meter.sort_ms.toFixed(1)} ms`;
+  showStats(drawn, seconds);
   Object.assign(meter, { drawn: 0, frames: 0, since: now });
+}
+
+function showStats(drawn, seconds) {
+  const { traffic = {}, visible = 0 } = meter;
+  const ms = (value) => `${(value ?? 0).toFixed(1)} ms`;
+  const rate_kb = (traffic.bytes - (meter.bytes ?? 0)) / 1000 / seconds;
+  meter.bytes = traffic.bytes;
+  const rows = {
+    "drawn": drawn, "Gaussians drawn": visible.toLocaleString("en"), "decode, server": ms(traffic.decode_ms),
+    "unpack": ms(traffic.unpack_ms), "sort": ms(meter.sort_ms), "draw, processor": ms(meter.submit_ms),
+    "draw, GPU": splats.gpu_ms === null ? "not told" : ms(splats.gpu_ms), "stalls": player.stalls,
+    "received": `${((traffic.bytes ?? 0) / 1e6).toFixed(2)} MB`, "network": `${(rate_kb || 0).toFixed(0)} kB/s`,
+    "picture": `${canvas.width} × ${canvas.height}`,
+  };
+  at("stats").replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [
+    Object.assign(document.createElement("dt"), { textContent: name }),
+    Object.assign(document.createElement("dd"), { textContent: value }),
+  ]));
 }
 
 function showLegend() {
@@ -247,9 +284,14 @@ function showLegend() {
 function notice(text, bad = false) { // what went wrong stays until it is mended
   if (!text && buffer.trouble) [text, bad] = [buffer.trouble, true];
   const box = at("wait");
-  box.hidden = !text;
-  box.textContent = text;
+  box.hidden = !text || (buffer.closed && text === buffer.trouble);
+  at("notice").textContent = text;
   box.classList.toggle("bad", bad);
+}
+
+function dismiss() {
+  buffer.closed = Boolean(buffer.trouble);
+  at("wait").hidden = true;
 }
 
 function fillPage() {
@@ -267,6 +309,8 @@ function fillPage() {
     at("cameras").append(button);
   }
   at("cameras-head").hidden = !scene.cameras.length;
+  for (const [name, mask] of bandsOf(scene.sh_degree)) at("bands").append(new Option(name, mask));
+  at("bands-row").hidden = !scene.sh_degree;
   grantWish();
   setPlaying(player.playing);
   setNear(0);
@@ -275,6 +319,9 @@ function fillPage() {
 function grantWish() {
   const camera = scene.cameras.find(({ name }) => name === wish.get("camera")) ?? scene.cameras[0];
   if (camera) navigation.lookFrom(camera, { animate: false, isHome: true });
+  if (wish.has("view")) navigation.recall(wish.get("view").split(",").map(Number));
+  if (wish.has("bands")) setBands(Number(wish.get("bands")) || 0);
+  if (ENDS[wish.get("ends")]) setEnds(wish.get("ends"));
   if (MODES.includes(wish.get("mode"))) setMode(wish.get("mode"));
   if (wish.has("scale")) setScale(Number(wish.get("scale")) || 1);
   if (wish.has("background")) look.background = wish.get("background").split(",").map(Number);
@@ -319,10 +366,96 @@ function setBackground() {
   dirty = true;
 }
 
-function toggleLoop() {
-  player.loops = !player.loops;
-  press("loop", player.loops);
-  tellPlayhead();
+function setEnds(ends) {
+  Object.assign(player, { ends, step: 1 });
+  at("ends").textContent = ENDS[ends];
+  if (scene) tellPlayhead();
+}
+
+function cycle(list, now) { return list[(list.indexOf(now) + 1) % list.length]; }
+
+function cycleEnds() { setEnds(cycle(Object.keys(ENDS), player.ends)); }
+
+// Bands of view dependence to draw, as bits: all, none but what is the same from everywhere, up to one, one alone.
+function bandsOf(degree) {
+  const upTo = Array.from({ length: Math.max(0, degree - 1) }, (_, k) => [`up to ${k + 1}`, 2 ** (k + 2) - 1]);
+  const alone = Array.from({ length: degree }, (_, k) => [`${k + 1} alone`, 2 ** (k + 1)]);
+  return [["all", 15], ["off", 1], ...upTo, ...alone];
+}
+
+function setBands(bands) {
+  look.bands = bands;
+  at("bands").value = bands;
+  dirty = true;
+}
+
+function cycleBands() { setBands(cycle(bandsOf(scene.sh_degree).map(([, mask]) => mask), look.bands)); }
+
+function setFolded(folded) {
+  document.body.classList.toggle("folded", folded);
+  press("more", !folded);
+  if (scene) drawMarks();
+}
+
+// ---- measuring
+
+function setMeasuring(on) {
+  Object.assign(ruler, { on, points: [] });
+  press("measure", on);
+  document.body.classList.toggle("measuring", on);
+  drawRuler();
+}
+
+function measureAt(event) {
+  const point = pointUnder(event);
+  if (point) ruler.points = ruler.points.length === 2 ? [point] : [...ruler.points, point]; // a third begins anew
+  drawRuler();
+}
+
+function drawRuler() {
+  const density = canvas.width / canvas.clientWidth;
+  const ends = ruler.points.map((point) => navigation.pixelOf(point)?.map((value) => value / density));
+  at("ruler").toggleAttribute("hidden", !ends.length || ends.includes(undefined));
+  if (!ends.length || ends.includes(undefined)) return;
+  const [line, first, second, text] = at("ruler").children, [a, b = a] = ends;
+  const set = (element, values) => Object.entries(values).forEach(([name, value]) => element.setAttribute(name, value));
+  set(line, { x1: a[0], y1: a[1], x2: b[0], y2: b[1] });
+  set(first, { cx: a[0], cy: a[1] });
+  set(second, { cx: b[0], cy: b[1] });
+  set(text, { x: (a[0] + b[0]) / 2 + 8, y: (a[1] + b[1]) / 2 - 8 });
+  text.textContent = ends.length === 2 ? spanText() : "";
+}
+
+function spanText() {
+  const [a, b] = ruler.points, span = Math.hypot(...a.map((value, k) => value - b[k]));
+  document.documentElement.dataset.span = span; // for automation
+  return `${span.toPrecision(4)} ${scene.metric ? "m" : "units"}`;
+}
+
+// ---- what is kept
+
+function linkHere() {
+  const now = new URLSearchParams({ frame: player.shown, play: 0, mode: look.mode, scale: look.scale, bands: look.bands });
+  const numbers = navigation.numbers().map((value) => Number(value.toPrecision(9)));
+  now.set(...(navigation.exact ? ["camera", navigation.exact] : ["view", numbers.join(",")]));
+  now.set("background", look.background.join(","));
+  if (look.lines) now.set("cameras", 1);
+  history.replaceState(null, "", `#${now}`);
+  const told = () => notice("This page's address now shows this very view.");
+  if (!navigator.clipboard) return told();
+  navigator.clipboard.writeText(location.href).then(() => notice("The link to this view is copied."), told);
+}
+
+function savePicture() {
+  drawPicture();
+  const name = `${scene.name.replace(/\.\w+$/, "")}_${String(player.shown).padStart(6, "0")}.png`;
+  canvas.toBlob((blob) => save(name, blob));
+}
+
+function save(name, blob) {
+  const link = Object.assign(document.createElement("a"), { download: name, href: URL.createObjectURL(blob) });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
 function toggleCameras() {
@@ -338,11 +471,21 @@ function cycleCamera(step) {
   navigation.lookFrom(cameras[(now + step + cameras.length) % cameras.length]);
 }
 
-function focusAt(event) {
+function depthUnder(event) { // with the pixel of the canvas
   const density = canvas.width / canvas.clientWidth;
   const [x, y] = [event.clientX * density, event.clientY * density];
   const depth = splats.depthAt(navigation.view(), look, Math.floor(x), Math.floor(y));
-  if (depth !== null) navigation.focus(x, y, depth);
+  return depth === null ? null : [x, y, depth];
+}
+
+function pointUnder(event) { // world; null where nothing is
+  const found = depthUnder(event);
+  return found && navigation.pointAt(...found);
+}
+
+function focusAt(event) {
+  const found = depthUnder(event);
+  if (found && !ruler.on) navigation.focus(...found);
 }
 
 const KEYS = {
@@ -354,10 +497,20 @@ const KEYS = {
   1: () => setMode("colour"),
   2: () => setMode("depth"),
   3: () => setMode("dynamic"),
+  4: () => setMode("opacity"),
+  5: () => setMode("map"),
+  b: () => { if (scene.sh_degree) cycleBands(); },
+  i: () => at("stats").toggleAttribute("hidden"),
+  m: () => setMeasuring(!ruler.on),
+  p: savePicture,
+  u: linkHere,
+  v: () => setFolded(!document.body.classList.contains("folded")),
+  x: () => { if (scene.worst !== undefined) { pause(); seek(scene.worst); } },
+  Escape: () => { dismiss(); setMeasuring(false); },
   f: () => setFlying(!navigation.flying),
   r: () => navigation.reset(),
   c: toggleCameras,
-  l: toggleLoop,
+  l: cycleEnds,
   h: () => document.body.classList.toggle("bare"),
   "[": () => cycleCamera(-1),
   "]": () => cycleCamera(1),
@@ -376,6 +529,12 @@ function listen() {
     action(event);
   });
   canvas.addEventListener("dblclick", focusAt);
+  let pressed = null;
+  canvas.addEventListener("pointerdown", (event) => { pressed = event; });
+  canvas.addEventListener("click", (event) => { // what was dragged turns the view
+    const still = pressed && Math.hypot(event.clientX - pressed.clientX, event.clientY - pressed.clientY) < 4;
+    if (ruler.on && still && scene) measureAt(event);
+  });
   canvas.addEventListener("webglcontextlost", () => notice("The graphics driver gave up this page; reload it.", true));
   addEventListener("resize", () => { if (scene) drawMarks(); });
   for (const mode of MODES) at(`mode-${mode}`).onclick = () => setMode(mode);
@@ -387,18 +546,26 @@ function listen() {
   at("background").onchange = setBackground;
   at("show-cameras").onclick = toggleCameras;
   at("play").onclick = () => setPlaying(!player.playing);
-  at("loop").onclick = toggleLoop;
+  at("ends").onclick = cycleEnds;
+  at("back").onclick = () => KEYS.ArrowLeft({});
+  at("forth").onclick = () => KEYS.ArrowRight({});
+  at("bands").onchange = (event) => setBands(Number(event.target.value));
+  at("measure").onclick = KEYS.m;
+  at("link").onclick = linkHere;
+  at("shot").onclick = savePicture;
+  at("dismiss").onclick = dismiss;
   at("speed").onchange = (event) => { player.speed = Number(event.target.value); };
   at("scrub").oninput = (event) => { scrubbing = true; seek(Number(event.target.value)); };
   at("scrub").onchange = () => { scrubbing = false; };
   at("ask").onclick = () => at("help").showModal();
-  at("more").onclick = () => press("more", at("side").classList.toggle("open"));
+  at("more").onclick = KEYS.v;
 }
 
 try {
   splats = new SplatView(canvas);
   setBackground();
   listen();
+  setFolded(matchMedia("(max-width: 640px), (max-height: 480px)").matches);
   worker.postMessage({ type: "open" });
 } catch (error) {
   notice(error.message, true);

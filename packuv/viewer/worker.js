@@ -19,7 +19,7 @@ const keys = new Map(); // segment -> Promise of a key
 const frames = new Map(); // frame -> {segment, packed, bytes}
 const fetching = new Map(); // frame -> AbortController
 const lost = new Set(); // frames that are damaged or missing; the rest plays on without them
-let playhead = { frame: 0, loops: true };
+let playhead = { frame: 0, step: 1, ends: "loop" };
 let failures = 0;
 let resumeAt = 0; // no fetch before this time after a failure
 let sent = { segment: -1, frame: -1 }; // what the page holds
@@ -55,6 +55,16 @@ class LostError extends Error {}
 
 // ---- fetching
 
+const traffic = { bytes: 0, decode_ms: 0, unpack_ms: 0 }; // since the page was opened; of the last frame
+
+// What a body took on its way, by the browser's own record, and the server by its word.
+function tally(path) {
+  const record = performance.getEntriesByName(new URL(path, location.href).href).at(-1);
+  traffic.bytes += record?.transferSize ?? 0;
+  traffic.decode_ms = record?.serverTiming?.find(({ name }) => name === "decode")?.duration ?? 0;
+  performance.clearResourceTimings();
+}
+
 function ahead() {
   const frame = frames.values().next().value;
   const affordable = frame ? Math.floor((0.75 * BUDGET_BYTES) / Math.max(1, frame.bytes)) : 8;
@@ -63,11 +73,13 @@ function ahead() {
 }
 
 function upcoming() {
-  const list = [];
-  for (let step = 0; step < ahead(); step++) {
-    const frame = playhead.frame + step;
-    if (frame < owners.length) list.push(frame);
-    else if (playhead.loops) list.push(frame % owners.length);
+  const list = [], count = owners.length;
+  let { frame, step } = playhead;
+  for (let left = ahead(); left > 0 && frame >= 0 && frame < count; left--) {
+    list.push(frame);
+    if (playhead.ends === "bounce" && (frame + step < 0 || frame + step >= count)) step = -step;
+    frame += step;
+    if (playhead.ends === "loop") frame %= count;
   }
   return list;
 }
@@ -88,11 +100,15 @@ async function load(frame) {
   const control = new AbortController();
   fetching.set(frame, control);
   try {
+    const path = `frames/${frame}.bin`;
     const [bytes, key] = await Promise.all([
-      get(`frames/${frame}.bin`, control.signal).then((answer) => answer.arrayBuffer()),
+      get(path, control.signal).then((answer) => answer.arrayBuffer()),
       keyOf(owners[frame]),
     ]);
+    tally(path);
+    const started = performance.now();
     if (!control.signal.aborted) keep(frame, unpackFrame(bytes, key));
+    traffic.unpack_ms = performance.now() - started;
     if (failures) postMessage({ type: "problem", text: "" });
     failures = 0;
   } catch (error) {
@@ -142,7 +158,8 @@ function reportBuffer() {
 function keyOf(segment) {
   const known = keys.get(segment);
   if (known) { keys.delete(segment); keys.set(segment, known); return known; } // youngest last
-  const bytes = get(`segments/${segment}.bin`).then((answer) => answer.arrayBuffer());
+  const path = `segments/${segment}.bin`;
+  const bytes = get(path).then((answer) => answer.arrayBuffer()).finally(() => tally(path));
   const promise = bytes.then((body) => unpackKey(body, segment));
   promise.catch((error) => {
     keys.delete(segment);
@@ -244,6 +261,7 @@ async function show({ frame, eye, forward, near, spare }) {
   const started = performance.now();
   Object.assign(answer, order(key, eye, forward, near, spare));
   answer.sort_ms = performance.now() - started;
+  answer.traffic = { ...traffic };
   postMessage(answer, [...transfer, answer.order.buffer]);
 }
 

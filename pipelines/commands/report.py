@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from itertools import zip_longest
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,30 +17,9 @@ from pipelines.commands.output import answer
 from pipelines.commands.terminal import print_table
 from pipelines.request import read_settings
 from tasks.artefacts.recipe import OptionError, override
+from tasks.report import compare
 from tasks.report.dataset import Line, page_text
 from tasks.report.write import JSON_NAME, PAGE_NAME
-
-FIGURES = {
-    "psnr_db": "PSNR, dB",
-    "psnr_moving_db": "PSNR where it moves, dB",
-    "psnr_still_db": "PSNR where it is still, dB",
-    "foreground_db": "PSNR of the foreground, dB",
-    "foreground_ssim": "SSIM of the foreground",
-    "foreground_lpips": "LPIPS of the foreground",
-    "ssim": "SSIM",
-    "tof_px": "tOF, px",
-    "flicker": "flicker",
-    "lpips": "LPIPS",
-    "mb_per_30_frames": "MB per 30 frames",
-    "frames": "frames",
-    "seconds": "total time, s",
-    "peak_memory_bytes": "peak memory, bytes",
-    "scored_cameras": "scored cameras",
-    "held_out": "held-out cameras",
-    "verified": "decodes exactly",
-}
-"""Of a summary, as the comparison calls them"""
-
 
 STATES = {"finished": "finished", "cancelled": "cancelled", "stopped": "cancelled"}
 """By how a run ended, what the page calls it; all else has failed"""
@@ -53,8 +30,10 @@ def command(arguments: argparse.Namespace) -> int:
     given = [arguments.run is not None, arguments.compare is not None, arguments.dataset is not None]
     if sum(given) != 1:
         raise ValueError("report needs the folder of a run, --compare A B or --dataset DIR, and one of them only")
+    if arguments.output and not arguments.compare:
+        raise ValueError("--output names the page of --compare A B; other reports lie in the folder that they are of")
     if arguments.compare:
-        return _compare(*arguments.compare, as_json=arguments.json)
+        return _compare(arguments)
     if arguments.dataset:
         return _dataset(arguments.dataset, as_json=arguments.json)
     return _again(arguments)
@@ -79,17 +58,6 @@ def _again(arguments: argparse.Namespace) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Something in which two runs differ; None where a run lacks it."""
-
-    kind: str
-    """setting, version, figure, camera or finding"""
-    name: str
-    a: Any
-    b: Any
-
-
 def read_report(path: Path) -> dict[str, Any]:
     """report.json of a run, given as this file or its folder.
 
@@ -107,65 +75,28 @@ def read_report(path: Path) -> dict[str, Any]:
     return told
 
 
-def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[Difference]:
-    """What differs between two reports: settings, versions, figures, cameras' scores, findings; in this order."""
-    for kind, name in (("setting", "options"), ("version", "versions")):
-        yield from _fields(kind, _flat(a["run"][name] or {}), _flat(b["run"][name] or {}))
-    figures = [{told: report["summary"].get(name) for name, told in FIGURES.items()} for report in (a, b)]
-    yield from _fields("figure", *figures)
-    yield from _fields("camera", _levels(a), _levels(b))
-    texts = [[finding["text"] for finding in report["findings"]] for report in (a, b)]
-    only = [[text for text in own if text not in other] for own, other in (texts, texts[::-1])]
-    yield from (Difference("finding", "", first, second) for first, second in zip_longest(*only))
-
-
-def _fields(kind: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[Difference]:
-    for name in dict.fromkeys([*a, *b]):
-        if a.get(name) != b.get(name):
-            yield Difference(kind, name, a.get(name), b.get(name))
-
-
-def _flat(tree: Mapping[str, Any], place: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in tree.items():
-        found |= _flat(value, f"{place}{name}.") if isinstance(value, Mapping) else {f"{place}{name}": value}
-    return found
-
-
-def _levels(report: Mapping[str, Any]) -> dict[str, float]:
-    """Mean PSNR of each scored camera, dB."""
-    levels: dict[str, list[float]] = {}
-    for score in report["scores"]:
-        levels.setdefault(f"PSNR of {score['camera']}, dB", []).append(score["psnr_db"])
-    return {name: sum(own) / len(own) for name, own in levels.items()}
-
-
-def _compare(first: Path, second: Path, *, as_json: bool) -> int:
+def _compare(arguments: argparse.Namespace) -> int:
+    first, second = arguments.compare
     a, b = read_report(first), read_report(second)
-    found = list(differences(a, b))
-    if as_json:
-        answer(json.dumps({"a": str(first), "b": str(second), "differences": [vars(item) for item in found]}, indent=1))
+    found = list(compare.differences(a, b))
+    if page := arguments.output:
+        with whole_file(page) as part:
+            part.write_text(compare.page_text(a, b, names=(str(first), str(second))), encoding="utf-8")
+    if arguments.json:
+        told = {"a": str(first), "b": str(second), "page": page and str(page)}
+        answer(json.dumps({**told, "differences": [vars(item) for item in found]}, indent=1))
         return 0
     table = Table("", "what", f"A  {first}", f"B  {second}", "B - A")
     for item in found:
-        table.add_row(*(Text(cell) for cell in (item.kind, item.name, _shown(item.a), _shown(item.b), _change(item))))
+        change = "" if item.change is None else f"{item.change:+.4g}"
+        cells = (item.kind, item.name, compare.shown(item.a), compare.shown(item.b), change)
+        table.add_row(*map(Text, cells))
     for name, report in (("A", a), ("B", b)):
-        print(f"{name}  {(report.get('verdict') or {'text': 'written before there were verdicts'})['text']}")
+        print(f"{name}  {compare.verdict_text(report)}")
     print_table(table) if found else print("nothing differs")
+    if page:
+        print(page)
     return 0
-
-
-def _shown(value: Any) -> str:
-    if value is None:
-        return "–"
-    if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) < 1000 else f"{value:,.0f}"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def _change(item: Difference) -> str:
-    numbers = [value for value in (item.a, item.b) if isinstance(value, (int, float)) and not isinstance(value, bool)]
-    return f"{numbers[1] - numbers[0]:+.4g}" if len(numbers) == 2 and item.kind in ("figure", "camera") else ""
 
 
 def _dataset(folder: Path, *, as_json: bool) -> int:
@@ -185,7 +116,7 @@ def _dataset(folder: Path, *, as_json: bool) -> int:
     table = Table("sequence", "state", "PSNR, dB", "MB a frame", "time, min", "findings", "verdict")
     for line in sorted(lines, key=lambda line: (line.rank, line.psnr_db or 0, line.name)):
         minutes = None if line.hours is None else 60 * line.hours
-        figures = map(_shown, (line.psnr_db, line.mb_per_frame, minutes, line.findings))
+        figures = map(compare.shown, (line.psnr_db, line.mb_per_frame, minutes, line.findings))
         cells = (line.name, line.status, *figures, line.verdict or line.reason)
         table.add_row(*(Text(cell) for cell in cells))
     print_table(table)

@@ -6,7 +6,9 @@ What turns scenes into other programs' files, or those into scenes, is in `pipel
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -286,6 +288,23 @@ def _score_text(means: Mapping[str, float | None], kind: str) -> str:
 def view(arguments: argparse.Namespace) -> int:
     """`packuv view`: until Ctrl-C."""
     from packuv.viewer import serve
+    from packuv.viewer.server import LOOPBACK
 
-    serve(arguments.scene, port=arguments.port, open_browser=True)
+    worst = _worst_frame(arguments.scene.parent)
+    if arguments.host not in LOOPBACK:
+        told = f"packuv: everyone who can reach {arguments.host} sees this scene, without a password; end with Ctrl-C"
+        print(told, file=sys.stderr)
+    serve(arguments.scene, host=arguments.host, port=arguments.port, open_browser=True, worst=worst)
     return 0
+
+
+def _worst_frame(folder: Path) -> int | None:
+    """That the report in a folder tells; None where there is none."""
+    from tasks.report.facts import FrameScore, mean_by_frame
+
+    try:
+        scores = json.loads((folder / "report.json").read_text())["scores"]
+        means = mean_by_frame([FrameScore(one["camera"], one["frame"], one["psnr_db"], one["ssim"]) for one in scores])
+    except (OSError, ValueError, KeyError, TypeError):  # a viewer shows scenes without reports, too
+        return None
+    return min(means, key=lambda frame: means[frame]) if means else None

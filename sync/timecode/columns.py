@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fractions import Fraction
@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from sync.timecode.digits import parse_decimals
 from sync.timecode.labels import counting_notes, day_of, is_clock, is_label, read_clocks, read_labels
 from sync.timecode.series import DAY_NS, Timecodes, counted_from_first, unwrapped, wrap_notes
-from sync.timecode.tables import Table, plain
+from sync.timecode.tables import Table, plain, whole
 from sync.tree import TIME_LIMIT_NS
 
 UNIT_POWERS = {"ns": 0, "us": 3, "ms": 6, "s": 9}
@@ -23,6 +23,8 @@ UNIT_POWERS = {"ns": 0, "us": 3, "ms": 6, "s": 9}
 
 INDEX_COLUMNS = ("frame_number", "frame_index", "frame_id", "frame_no", "frame_num", "frame", "index", "idx")
 TIME_WORDS = {"time", "timestamp", "timestamps", "timecode", "ts", "pts", "epoch"}
+SHORT_TIME_WORDS = {"t", "datetime", "utc"}
+"""That name a time where no column has one of the others"""
 
 SOME = 1000
 """Rows that tell of all"""
@@ -34,7 +36,7 @@ STALL = 1000.0
 """Usual gaps that may lie before a last line"""
 NEAR = 2.0
 """Factor either way by which times may be further apart than the frames of the video: cameras drop frames"""
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)([.,]\d{1,12})?\s*(Z|[+-]\d\d(?::?\d\d)?)?")
+_ISO = re.compile(r"(\d{4}[-/]\d\d[-/]\d\d)[T ](\d\d:\d\d:\d\d)([.,]\d{1,12})?\s*(Z|[+-]\d\d(?::?\d\d)?)?")
 
 _UNIT = re.compile(
     r"(?:^|_)(?:(ns|nsecs?|nanos|nanoseconds?)|(us|usecs?|micros|microseconds?)|(ms|msecs?|millis|milliseconds?)"
@@ -106,7 +108,7 @@ def _time_column(table: Table, column: str | None) -> str:
         if column not in table.columns:
             raise ValueError(f"{table.path} has no column {column!r}; it has {list(table.columns)}")
         return column
-    fits = [name for name in table.columns if TIME_WORDS & set(plain(name).split("_"))]
+    fits = next(filter(None, (_named(table, words) for words in (TIME_WORDS, SHORT_TIME_WORDS))), [])
     if len(fits) != 1:
         found = f"{len(fits)} of them: {fits}" if fits else "none"
         raise ValueError(
@@ -114,6 +116,11 @@ def _time_column(table: Table, column: str | None) -> str:
             "name it in capture.toml: timecode_column = '...'"
         )
     return fits[0]
+
+
+def _named(table: Table, words: Set[str]) -> list[str]:
+    """Columns with one of these words in their names."""
+    return [name for name in table.columns if words & set(plain(name).split("_"))]
 
 
 def _times(table: Table, name: str, rows: np.ndarray, rate: Fraction | None, period_ns: int | None) -> _Read:
@@ -142,7 +149,9 @@ def _calendar(table: Table, rows: np.ndarray, values: Sequence[str]) -> np.ndarr
             if match is None:
                 raise ValueError
             zone = (match[4] or "Z").replace("Z", "+00:00")
-            moment = datetime.fromisoformat(f"{match[1]}T{match[2]}{zone if len(zone) > 3 else zone + ':00'}")
+            moment = datetime.fromisoformat(
+                f"{match[1].replace('/', '-')}T{match[2]}{zone if len(zone) > 3 else zone + ':00'}"
+            )
         except ValueError:
             raise ValueError(
                 f"{table.place(int(rows[row]))}: expected a date and time as 2026-11-28T12:34:56.789, got {value!r}"
@@ -198,6 +207,8 @@ def _fitting_units(table: Table, name: str, rows: np.ndarray, period_ns: int | N
 def _numbers(table: Table, name: str, rows: np.ndarray, power: int, *, integer: bool = False) -> np.ndarray:
     """Column of decimal text times 10 to `power`, int64 [len(rows)]; digits beyond are rounded half away from 0."""
     values = _with_points(table.columns[name].take(pa.array(rows)))
+    if integer and pc.any(pc.match_substring(values, ".")).as_py():
+        values = pa.array([whole(value) for value in values.to_pylist()], pa.string())
     _, offsets, data = values.buffers()
     ends = np.frombuffer(offsets, np.int32)[: len(values) + 1]
     text = np.frombuffer(data, np.uint8) if data is not None and data.size else np.zeros(1, np.uint8)

@@ -19,8 +19,12 @@ FASTEST_GAP_NS, SLOWEST_GAP_NS = 10_000, 3600 * NANOSECONDS
 """No camera of a rig films faster than 100,000 or slower than one frame an hour: beyond, the unit is misread."""
 
 
-SUFFIXES = (".csv", ".tsv", ".txt", ".log", ".json", ".npy")
+SUFFIXES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".npy")
 """Of files with timecodes"""
+
+
+_UNIT_END = re.compile(r"[ _]?[\[(]?(?<=[ _\[(])(?:ns|us|ms|s)[\])]?$")
+"""Of a column that is named after a camera: cam01_us, cam01 [us]"""
 
 
 def read_timecodes(
@@ -58,10 +62,10 @@ def read_timecodes(
 
 def _table(path: Path, kind: str, data: bytes, column: str | None) -> Table:
     match kind:
-        case ".json":
+        case ".json" | ".jsonl":
             return json_table(path, data, column)
         case ".npy":
-            return npy_table(path, data)
+            return npy_table(path, data, column)
         case ".txt" | ".log":
             return number_table(path, data, column)
     return csv_table(path, data, column)
@@ -88,26 +92,31 @@ def read_shared_timecodes(
     column: str | None = None,
     period_ns: Mapping[str, int] | None = None,
 ) -> dict[str, Timecodes]:
-    """Read the timecodes of several cameras from the one CSV table that they share.
+    """Read the timecodes of several cameras from the one CSV table that they share: a row for each frame that tells
+    whose it is, or a column for each camera.
 
     Raises:
         ValueError: as `read_timecodes`, or two cameras would take the same rows.
     """
     table, periods, rates = csv_table(path, read_text_bytes(path)), period_ns or {}, rates or {}
-    if table.camera is None:
-        raise ValueError(f"{path} is shared by all cameras, so one of its columns must be {_either(CAMERA_COLUMNS)}")
-    ids = table.cameras
+    by_column = table.camera is None
+    columns = {_UNIT_END.sub("", name): name for name in table.columns} | {name: name for name in table.columns}
+    ids = list(columns) if by_column else table.cameras
+    if by_column and not any(_is_camera(camera, ids) for camera in cameras):
+        raise ValueError(
+            f"{path} is shared by all cameras, so one of its columns must be {_either(CAMERA_COLUMNS)}, or it must "
+            f"have a column of times for each camera; it has {list(table.columns)[:8]}"
+        )
     chosen = {camera: match_camera(camera, ids) for camera in cameras}
     for name in chosen.values():
         twins = [other for other in cameras if chosen[other] == name]
         if len(twins) > 1:
             raise ValueError(f"{path}: rows of {name!r} would serve cameras {twins}; give the rows the videos' names")
-    found = {
-        camera: table_timecodes(table, table.rows_of(name), rates.get(camera), column, periods.get(camera))
-        for camera, name in chosen.items()
-    }
-    for timecodes in found.values():
-        _check_gaps(path, timecodes)
+    found = {}
+    for camera, name in chosen.items():
+        rows, times = (table.filled(columns[name]), columns[name]) if by_column else (table.rows_of(name), column)
+        found[camera] = table_timecodes(table, rows, rates.get(camera), times, periods.get(camera))
+        _check_gaps(path, found[camera])
     return found
 
 
@@ -127,6 +136,14 @@ def match_camera(camera: str, ids: Sequence[str]) -> str:
     if len(fits) != 1:
         raise ValueError(f"camera {camera!r} must be one of the table's cameras {sorted(ids)}, or end in its number")
     return fits[0]
+
+
+def _is_camera(camera: str, ids: Sequence[str]) -> bool:
+    try:
+        match_camera(camera, ids)
+    except ValueError:
+        return False
+    return True
 
 
 def _rows_of(table: Table, camera: str | None) -> np.ndarray | None:

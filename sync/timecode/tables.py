@@ -24,6 +24,8 @@ NANOSECOND_LIST = "timestamp_ns"
 TIME_COLUMN, INDEX_COLUMN = "timestamp", "frame"
 """Column names where a file names none"""
 COMMENT = b"#"
+MOST_COUNTED = 10**9
+"""What is more is a time, as seconds since 1970 are"""
 VERSION_2 = re.compile(rb"#\s*time(?:code|stamp) format v2", re.IGNORECASE)
 """First line of a file of milliseconds, as mkvmerge and VirtualDub write and read them"""
 
@@ -56,6 +58,13 @@ class Table:
         """Rows of one id in the camera's column, int64."""
         assert self.camera is not None
         return np.flatnonzero(pc.equal(self.columns[self.camera], camera).to_numpy(zero_copy_only=False))
+
+    def filled(self, name: str) -> np.ndarray:
+        """Rows that hold something in a column, int64; raises ValueError where none does."""
+        rows = np.flatnonzero(pc.not_equal(self.columns[name], "").to_numpy(zero_copy_only=False))
+        if not len(rows):
+            raise ValueError(f"{self.path}: column {name!r} is empty; a camera needs at least one timecode")
+        return rows
 
     def place(self, row: int) -> str:
         """Where row `row` stands, for people."""
@@ -112,9 +121,9 @@ def number_table(path: Path, data: bytes, column: str | None = None) -> Table:
     table = Table(path, {}, lines, named=False, whole=whole)
     if short is not None:
         raise ValueError(f"{table.place(short)}: expected {wide} columns as in the first line, got {len(cells[short])}")
-    counted = wide > 1 and [cell[0] for cell in cells[:3]] in (["0", "1", "2"], ["1", "2", "3"])
+    counted = _is_counted([cell[0] for cell in cells[:3]], wide)
     place = _column_number(path, column, wide) if column is not None else int(counted)
-    if column is None and wide > 1 and not counted and path.suffix.lower() in (".csv", ".tsv"):
+    if column is None and wide > 1 and not counted and path.suffix.lower() in (".csv", ".tsv", ".npy"):
         raise ValueError(
             f"{path} has {wide} columns and no header; say which holds the time in capture.toml: timecode_column = '1' "
             "for the first, or give it a first line with names"
@@ -127,15 +136,20 @@ def number_table(path: Path, data: bytes, column: str | None = None) -> Table:
     return Table(path, columns, lines, named=False, whole=whole)
 
 
-def npy_table(path: Path, data: bytes) -> Table:
-    """An array [n] of numbers, as `numpy.save` writes it; floats by their shortest text."""
+def npy_table(path: Path, data: bytes, column: str | None = None) -> Table:
+    """An array [n] of times, as `numpy.save` writes it, or [n, columns] as `number_table`; floats by their shortest
+    text."""
     try:
         values = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
         raise ValueError(f"{path} is no array that numpy can load: {error}") from None
-    if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "iufM" or not len(values):
+    fits = isinstance(values, np.ndarray) and values.ndim in (1, 2) and values.dtype.kind in "iufM" and values.size
+    if not fits:
         shape = getattr(values, "shape", "no array")
-        raise ValueError(f"{path} must hold an array [n] of times, one or more, but holds {shape}")
+        raise ValueError(f"{path} must hold an array [n] of times, or [n, 2] of a count and times, but holds {shape}")
+    if values.ndim == 2 and values.shape[1] > 1:
+        return _rows_table(path, values.tolist(), column)
+    values = values.ravel()
     if values.dtype.kind == "M":
         values = values.astype("datetime64[ns]").astype(np.int64)
         return Table(path, {NANOSECOND_LIST: pa.array([str(value) for value in values], pa.string())}, None)
@@ -146,19 +160,15 @@ def npy_table(path: Path, data: bytes) -> Table:
 
 
 def json_table(path: Path, data: bytes, column: str | None = None) -> Table:
-    """A list of whole numbers (ns), other times or labels, of objects, or of lists, or an object of lists; numbers stay
-    text on the way in."""
-    try:
-        items = json.loads(data, parse_int=str, parse_float=str, parse_constant=str)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no JSON: {error}") from None
-    if isinstance(items, dict):  # of columns
-        items = _transposed(path, items)
+    """A list of whole numbers (ns), other times or labels, of objects, or of lists; an object of lists, one a column,
+    of times by frame number, or that has such a list; or an object a line. Numbers stay text on the way in."""
+    items = _json_items(path, data)
+    if isinstance(items, dict):
+        items = _as_list(path, items)
     if not isinstance(items, list) or not items:
         raise ValueError(f"{path} must hold a list of nanoseconds, of objects or of lists, with at least one item")
     if isinstance(items[0], list):
-        rows = "\n".join("\t".join(str(cell) for cell in item) if isinstance(item, list) else "" for item in items)
-        return number_table(path.with_suffix(".json"), rows.encode() + b"\n", column)
+        return _rows_table(path, items, column)
     if not isinstance(items[0], dict):
         items = [{_list_name(items): item} for item in items]
     columns: dict[str, list[str]] = {name: [] for name in items[0]}
@@ -168,13 +178,41 @@ def json_table(path: Path, data: bytes, column: str | None = None) -> Table:
     return Table(path, {name: pa.array(values, pa.string()) for name, values in columns.items()}, None)
 
 
-def _transposed(path: Path, columns: Mapping[str, Any]) -> list[dict[str, Any]]:
-    lists = {name: values for name, values in columns.items() if isinstance(values, list)}
+def _json_items(path: Path, data: bytes) -> Any:
+    """What a file of JSON holds, or one of an object a line, as a list."""
+
+    def parse(text: bytes) -> Any:
+        return json.loads(text, parse_int=str, parse_float=str, parse_constant=str)
+
+    lines = [line for line in data.splitlines() if line.strip()]
+    try:
+        if len(lines) > 1 and lines[0].startswith(b"{") and lines[0].rstrip().endswith(b"}"):
+            return [parse(line) for line in lines]
+        return parse(data)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no JSON: {error}") from None
+
+
+def _as_list(path: Path, items: Mapping[str, Any]) -> list[Any]:
+    """The rows of an object: of columns, of times by frame number, or of one list of objects beside other facts."""
+    lists = {name: values for name, values in items.items() if isinstance(values, list)}
+    if len(lists) == 1 and all(isinstance(item, dict) for values in lists.values() for item in values):
+        return next(iter(lists.values()))
+    if items and all(name.isdecimal() and isinstance(value, str) for name, value in items.items()):
+        rows = sorted(items.items(), key=lambda item: int(item[0]))
+        return [{INDEX_COLUMN: name, _list_name([value for _, value in rows]): value} for name, value in rows]
     if not lists or len({len(values) for values in lists.values()}) != 1:
         raise ValueError(
-            f"{path} must hold a list, or lists of one length, one a column, but holds {list(columns)[:8]}"
+            f"{path} must hold a list, lists of one length, one a column, or times by frame number, but holds "
+            f"{list(items)[:8]}"
         )
     return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+
+
+def _rows_table(path: Path, rows: Sequence[Any], column: str | None) -> Table:
+    """As `number_table`, of lists."""
+    text = "\n".join("\t".join(str(cell) for cell in row) if isinstance(row, list) else "" for row in rows)
+    return number_table(path, text.encode() + b"\n", column)
 
 
 def _list_name(items: Sequence[Any]) -> str:
@@ -214,6 +252,22 @@ def _has_decimal_comma(rows: Sequence[str]) -> bool:
     return any(before[0] == after[0] for before, after in pairwise(parts))
 
 
+def _is_counted(first: Sequence[str], wide: int) -> bool:
+    """Whether lines begin with a count, of which these are the first: 0 or 1, 2, ...; of two columns also from
+    elsewhere, and as floats (`numpy.savetxt`)."""
+    if wide != 2:
+        return wide > 1 and list(first) in (["0", "1", "2"], ["1", "2", "3"])
+    values = [whole(cell) for cell in first]
+    if len(values) < 3 or not all(value.isdecimal() for value in values):
+        return False
+    return int(values[0]) < MOST_COUNTED and all(int(b) == int(a) + 1 for a, b in pairwise(values))
+
+
+def whole(cell: str) -> str:
+    """A whole number that is written as a float without its decimals, anything else as it is."""
+    return str(int(float(cell))) if _FLOAT.fullmatch(cell) and float(cell).is_integer() else cell
+
+
 def _column_number(path: Path, column: str, wide: int) -> int:
     if not column.isdecimal() or not 1 <= int(column) <= wide:
         raise ValueError(
@@ -228,7 +282,8 @@ def _json_text(item: Any, name: str, place: str) -> str:
     return str(item[name]).strip()
 
 
-_ISO_START = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_ISO_START = re.compile(r"\d{4}[-/]\d\d[-/]\d\d[T ]\d\d:\d\d")
+_FLOAT = re.compile(r"\d+\.\d*(?:e\+\d\d)?")
 
 
 def plain(name: str) -> str:

@@ -278,6 +278,11 @@ class ReportInput:
     options: Any = None
     """Options of the run: a dataclass or mapping that `tasks.artefacts.recipe.plain` takes"""
     versions: Mapping[str, str] = field(default_factory=dict)
+    """Of software and of what it writes"""
+    stage_versions: Mapping[str, int] = field(default_factory=dict)
+    """By kind of artefact: of the stage that made it"""
+    otherwise: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """What was there before and made otherwise: by "numpy 2.1.0, not 2.2.6", or processor, the kinds of artefacts"""
     host: str = ""
     """Machine and device"""
     finished: str = ""
@@ -307,13 +312,15 @@ class ReportInput:
     motion: MotionCurve | None = None
     scores: tuple[FrameScore, ...] = ()
     """Of held-out cameras; of fitted ones where none was held out"""
+    fitted: tuple[FrameScore, ...] = ()
+    """Of some fitted cameras at some frames, beside held-out ones"""
     scene: SceneFigures | None = None
     pictures: tuple[Comparison, ...] = ()
     stages: tuple[StageRecord, ...] = ()
     choice: Choice | None = None
+    """Where the user named a time or an error instead of a preset"""
     forecast: tuple[Compared, ...] = ()
     """Empty where nothing was forecast"""
-    """Where the user named a time or an error instead of a preset"""
 
 
 def scene_figures(scene: Scene, *, verified: bool | None = None, problem: str = "") -> SceneFigures:

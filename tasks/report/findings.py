@@ -13,6 +13,7 @@ import numpy as np
 from sync.content import Content
 from tasks.report.facts import ReportInput, StageOutcome, by_camera, mean_by_frame, mean_of, still_trend
 from tasks.report.limits import LIMITS, Limits
+from tasks.report.summary import contrast
 
 MOST_NAMES = 6
 """Cameras that one line names; the rest are counted"""
@@ -90,6 +91,14 @@ def _run_findings(report: ReportInput) -> Iterator[Finding]:
             yield Finding("run", text, Severity.BLOCKS, cure)
         if text := report.choice.late:
             yield Finding("run", text, Severity.NOTE, "Allow more time; `packuv plan` tells how much.")
+    if report.otherwise:
+        yield Finding(
+            "run",
+            "Some of what was there before was made by other software or another processor.",
+            Severity.NOTE,
+            "Nothing, unless results must be reproduced to the bit: then run into an empty folder.",
+            tuple(f"{', '.join(kinds)}: made by {how}." for how, kinds in report.otherwise.items()),
+        )
     for stage in report.stages:
         if stage.outcome is StageOutcome.FAILED:
             text = f"The stage {stage.label!r} failed: {stage.reason or 'no reason was given'}."
@@ -286,6 +295,7 @@ def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
             "No camera was held out, so the scores only tell how well the fit repeats what it saw.",
             cure="Run again with --hold-out and one or two cameras amid the others.",
         )
+    yield from _fitted_findings(report, limits)
     cameras = {name: float(np.mean([s.level_db for s in own])) for name, own in by_camera(report.scores).items()}
     middle = float(np.median(list(cameras.values())))
     for name, level in cameras.items():
@@ -317,6 +327,18 @@ def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
             cure="See whether light or exposure drifts (light over time), and keep light.enabled on.",
         )
     yield from _delivery_findings(report, float(np.mean(list(cameras.values()))), limits)
+
+
+def _fitted_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
+    beside = contrast(report)
+    if beside and beside.gap_db > limits.fitted_gap_db:
+        yield Finding(
+            "quality",
+            f"Fitted cameras score {beside.fitted.psnr_db:.1f} dB, unseen ones {beside.unseen.psnr_db:.1f} dB at the "
+            f"same frames: {beside.gap_db:.1f} dB of what was fitted is not there from elsewhere.",
+            cure="Take fewer fit.iterations or a smaller fit.density.cap, and more cameras; see that those held out "
+            "stand amid the others.",
+        )
 
 
 def _delivery_findings(report: ReportInput, overall: float, limits: Limits) -> Iterator[Finding]:

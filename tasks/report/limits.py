@@ -28,6 +28,9 @@ class Limits:
     """A frame whose mean is this far below the median frame: motion that the fit could not follow"""
     psnr_db: float = 20.0
     """A mean ratio below this, on unseen cameras where there are any, shows at a glance: not fit for delivery"""
+    fitted_gap_db: float = 8.0
+    """Fitted cameras this far above unseen ones at the same frames: the fit repeats what it saw, and other views do not
+    gain by it; docs/scores.md has what fits that went too far reach"""
     moving_db: float | None = None
     """Likewise, where something moves; none: moving areas block no delivery"""
     flicker: float | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +45,7 @@ from tasks.report.plots import (
     rig_views,
     sparkline,
 )
-from tasks.report.summary import summary
+from tasks.report.summary import Contrast, contrast, summary
 
 MANY_LINES = 6
 """With more cameras than this, only the worst and the mean are named"""
@@ -269,6 +270,7 @@ def _quality(report: ReportInput, limits: Limits) -> Body:
         "held_out": bool(report.held_out),
         "worst": _worst(report),
         "flicker": _flicker(report),
+        "beside": _beside(contrast(report), report, limits),
         "levels": line_chart(
             _level_lines(report, cameras, level),
             title="PSNR over time",
@@ -282,6 +284,25 @@ def _quality(report: ReportInput, limits: Limits) -> Body:
         "areas": _areas(report),
         "foreground": any(score.foreground_db is not None for score in report.scores),
         "trend_db": still_trend(report.scores),
+    }
+
+
+def _beside(both: Contrast | None, report: ReportInput, limits: Limits) -> View | None:
+    """Fitted cameras beside unseen ones, at the frames of the former."""
+    if both is None:
+        return None
+    frames = both.fitted.frames
+    fitted, unseen = (mean_by_frame(scores) for scores in (report.fitted, report.scores))
+    lines = [
+        Series("fitted", frames, [fitted[frame] for frame in frames], "s1"),
+        Series("unseen", frames, [unseen.get(frame, math.nan) for frame in frames], "s2"),
+    ]
+    return {
+        "levels": [("fitted", both.fitted), ("unseen", both.unseen)],
+        "gap_db": both.gap_db,
+        "far": both.gap_db > limits.fitted_gap_db,
+        "frames": frames,
+        "curve": line_chart(lines, title="Fitted and unseen cameras", x_label="frame", y_label="PSNR, dB", height=200),
     }
 
 
@@ -474,12 +495,18 @@ def _skipped(report: ReportInput) -> Body:
     return {"stages": rows + more}
 
 
+def _listed(versions: Mapping[str, Any]) -> str:
+    width = max((len(name) for name in versions), default=0)
+    return "\n".join(f"{name:<{width}}  {version}" for name, version in versions.items())
+
+
 def _run(report: ReportInput) -> Body:
     if not report.command and not report.versions and report.options is None:
         return "Neither the command nor the options were recorded."
     return {
         "command": report.command,
         "choice": report.choice,
-        "versions": "\n".join(f"{name:<18} {version}" for name, version in report.versions.items()),
+        "versions": _listed(report.versions),
+        "stage_versions": _listed(report.stage_versions),
         "options": "" if report.options is None else json.dumps(plain(report.options), indent=1),
     }

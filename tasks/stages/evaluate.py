@@ -6,7 +6,7 @@ import dataclasses
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from packuv.motion import MotionOptions, measure_motion
 from packuv.motion.foreground import compare_masks
 from packuv.progress import Progress
 from packuv.scene import SceneHeader, open_scene
-from packuv.score import Score, score, segment_starts, spread, summary, write_pictures, write_table
+from packuv.score import Likeness, Score, glance, score, segment_starts, spread, summary, write_pictures, write_table
 from sync.align import AlignOptions, FrameGroups, align
 from sync.capture import find_capture, find_masks, load_timecodes, probe_capture
 from sync.clock import ClockMode
@@ -35,14 +35,19 @@ from tasks.stages.plan import Plan
 from tasks.stages.synchronize import STARTS_NS, begun
 
 METRICS, TABLE, PICTURES = "metrics.json", "metrics.arrow", "pictures"
+FITTED = "fitted"
+"""Of the metrics: what fitted cameras score beside unseen ones"""
+GLANCE_FRAMES = 8
+"""At which fitted cameras are scored beside unseen ones, spread over the scene"""
 
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """Which cameras are scored where none is held out."""
+    """Which fitted cameras are scored, and whether LPIPS is measured."""
 
     fitted_cameras: int = 3
-    """Fitted cameras to score, spread over the rig, where no camera is held out"""
+    """Fitted cameras to score, spread over the rig: where no camera is held out, at every frame; else beside those that
+    are, at a few frames, which tells how much better a fit repeats what it saw"""
     lpips_weights: str | None = None
     """File of torchvision's AlexNet or VGG-16 weights, a state dict, to measure LPIPS with; nothing is downloaded"""
 
@@ -56,8 +61,10 @@ class Evaluate(Stage):
     """Score every frame of the scene file on the cameras of a take, and the foreground where masks tell it:
     metrics.json, metrics.arrow, pictures/."""
 
-    name, version = "evaluate", 4
+    name, version = "evaluate", 5
     take: Take
+    beside: tuple[str, ...] = ()
+    """Fitted cameras to score at a few frames, beside unseen ones"""
     scene: Key
     backbone: Files | None = None
     """Digest of the file at `weights`; None where LPIPS is not measured"""
@@ -68,6 +75,7 @@ class Evaluate(Stage):
 
     def build(self, work: Work) -> Notes:
         footage, scene = Footage(self.take, work.site), work.path(self.scene) / SCENE
+        fitted = Footage(replace(self.take, cameras=self.beside), work.site)
         views, silhouettes = footage.open_views(), footage.open_silhouettes()
         lpips = Lpips(Path(self.weights)) if self.backbone else None
         with open_scene(scene) as opened:
@@ -77,6 +85,10 @@ class Evaluate(Stage):
             write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
             borders = segment_starts(opened)
             facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=borders)
+            if self.beside:
+                few = spread(range(len(opened)), GLANCE_FRAMES)
+                seen = glance(opened, fitted.open_views(), few, work.progress)
+                facts[FITTED] = [asdict(likeness) for likeness in seen]
         save_json(work.out / METRICS, facts)
         notes = {name: facts[name] for name in ("cameras", "held_out", "mean")}
         return {**notes, "no_lpips": self.no_lpips} if self.no_lpips else notes
@@ -89,6 +101,19 @@ class Evaluate(Stage):
 def scored_cameras(plan: Plan, options: EvaluateOptions) -> tuple[str, ...]:
     """Those that are held out; where none is, some of the fitted ones."""
     return plan.held_out or spread(plan.fitted, options.fitted_cameras)
+
+
+def cameras_beside(plan: Plan, options: EvaluateOptions) -> tuple[str, ...]:
+    """Fitted cameras that are scored beside those held out."""
+    return spread(plan.fitted, options.fitted_cameras) if plan.held_out else ()
+
+
+def fitted_scores(metrics: Mapping[str, Any]) -> tuple[FrameScore, ...]:
+    """Scores of fitted cameras beside unseen ones, as the report shows them."""
+    known = [Likeness(**item) for item in metrics.get(FITTED, ())]
+    return tuple(
+        FrameScore(item.camera, item.frame, _level(item.psnr_calibrated_db), item.ssim_calibrated) for item in known
+    )
 
 
 def evaluate_scene(

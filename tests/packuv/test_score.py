@@ -28,6 +28,7 @@ from packuv.score import (
     Artist,
     Score,
     _Watch,
+    glance,
     read_table,
     score,
     summary,
@@ -120,7 +121,7 @@ def test_raw_scores_are_those_of_the_scene_in_its_light(tmp_path):
     assert max(raw[1:]) < 30
 
 
-def test_scores_do_not_depend_on_parts_and_go_on_after_a_kill(tmp_path, monkeypatch):
+def test_scores_depend_on_no_parts_go_on_after_a_kill_and_are_those_of_a_glance(tmp_path, monkeypatch):
     path = write_wall(tmp_path / "lit.mkv", LIGHT)
     rng = np.random.default_rng(0)
     film(tmp_path / "a.mp4", rng.random((3, 3, 64, 96)).astype(np.float32))
@@ -132,6 +133,14 @@ def test_scores_do_not_depend_on_parts_and_go_on_after_a_kill(tmp_path, monkeypa
             return score(scene, Views(videos, frames, lenses), progress, scratch=scratch)
 
     whole = scored()
+    with open_scene(path) as scene:
+        for few in ([0, 1, 2], [1], [0, 2]):
+            seen = glance(scene, Views(videos, frames, lenses), few, no_progress)
+            assert [vars(item) for item in seen] == [
+                {name: getattr(item, name) for name in ("camera", "frame", "psnr_calibrated_db", "ssim_calibrated")}
+                for item in whole
+                if item.frame in few
+            ]
     assert any(item.psnr_never_moving_db is not None for item in whole)
     monkeypatch.setattr("packuv.score.PART", 1)
     for kept in range(3):  # parts that a kill left

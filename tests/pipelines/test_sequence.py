@@ -94,6 +94,11 @@ def test_run_leaves_scene_report_and_record(first, capture):
     record = json.loads((outcome.folder / "run.json").read_text())
     report = json.loads((outcome.folder / "report.json").read_text())
     assert report["summary"]["scored_cameras"] == ["cam03"]
+    assert report["summary"]["fitted_cameras"] == ["cam01", "cam04", "cam05"]
+    assert sorted({item["frame"] for item in report["fitted"]}) == list(range(FRAMES))
+    versions = {key.split("/")[0] for key in artefacts(outcome).values()}
+    assert set(report["run"]["stage_versions"]) >= versions
+    assert report["run"]["otherwise"] == {}
     assert report["summary"]["verified"] is True
     assert record["options"]["fit"]["iterations"] == 20
     assert record["cameras"]["held_out"] == ["cam03"]

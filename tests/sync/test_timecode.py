@@ -132,7 +132,7 @@ def test_an_empty_file_is_refused(tmp_path: Path, suffix: str, content: str) -> 
 def test_missing_files_and_other_suffixes(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         read_timecodes(tmp_path / "a.txt")
-    with pytest.raises(ValueError, match=r"\.csv, \.tsv, \.txt, \.log, \.json or \.npy"):
+    with pytest.raises(ValueError, match=r"\.csv, \.tsv, \.txt, \.log, \.json, \.jsonl or \.npy"):
         read_timecodes(write(tmp_path / "a.dat", "1"))
 
 
@@ -253,6 +253,50 @@ def test_shared_tables_must_tell_cameras_apart(tmp_path: Path) -> None:
         read_shared_timecodes(path, ["left1", "right1"])
     with pytest.raises(ValueError, match="one of its columns must be"):
         read_shared_timecodes(write(tmp_path / "b.csv", "time_s\n1\n"), ["a", "b"])
+
+
+@pytest.mark.parametrize("names", ["left,right", "left_ms,right [ms]"])
+def test_a_shared_table_may_have_a_column_for_each_camera(tmp_path: Path, names: str) -> None:
+    path = write(tmp_path / "t.csv", f"frame,{names}\n7,100,\n8,133,130\n9,167,163\n")
+    found = read_shared_timecodes(path, ["left", "right"], period_ns=dict.fromkeys(["left", "right"], 33_333_333))
+    assert found["left"].times_ns.tolist() == [100_000_000, 133_000_000, 167_000_000]
+    assert found["right"].times_ns.tolist() == [130_000_000, 163_000_000]
+    assert found["left"].indices.tolist() == [0, 1, 2]
+    assert found["right"].indices.tolist() == [0, 1]
+    with pytest.raises(ValueError, match="camera 'other' must be one of"):
+        read_shared_timecodes(path, ["left", "other"])
+
+
+@pytest.mark.parametrize("kind", ["columns", "floats", "array", "objects", "nested", "lines", "by number"])
+def test_a_count_beside_the_times_is_no_time(tmp_path: Path, kind: str) -> None:
+    """Of 0.25, 0.28, 0.34 s, frames 0, 1 and 3 in all the ways in which people write them."""
+    frames, times = [0, 1, 2, 4], [0.25, 0.28125, 0.3125, 0.375]
+    both = np.stack([frames, times], axis=1)
+    rows = [{"frame": frame, "time_s": time} for frame, time in zip(frames, times, strict=True)]
+    path = tmp_path / {"array": "t.npy", "columns": "t.csv", "floats": "t.txt", "lines": "t.jsonl"}.get(kind, "t.json")
+    match kind:
+        case "columns":  # of which none is named as a time
+            write(path, "frame,t\n" + "\n".join(f"{frame},{time}" for frame, time in both))
+        case "floats":
+            np.savetxt(path, both)
+        case "array":
+            np.save(path, both)
+        case "objects":
+            write(path, json.dumps(rows))
+        case "nested":
+            write(path, json.dumps({"camera": "left", "frames": rows}))
+        case "lines":
+            write(path, "\n".join(json.dumps(row) for row in rows))
+        case "by number":
+            write(path, json.dumps(dict(zip(map(str, frames), times, strict=True))))
+    times_ns, indices = columns(path)
+    assert times_ns == [250_000_000, 281_250_000, 312_500_000, 375_000_000]
+    assert indices == frames
+
+
+def test_dates_may_have_slashes(tmp_path: Path) -> None:
+    path = write(tmp_path / "t.txt", "1970/01/01 00:00:01.5\n1970/01/01 00:00:02\n")
+    assert columns(path)[0] == [1_500_000_000, 2_000_000_000]
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from hypothesis import strategies as st
 from packuv.camera import PinholeCamera
 from packuv.colour import lit
 from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
+from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
 from packuv.raster import RasterOptions, render
 from packuv.scene import SceneHeader, open_scene, write_scene
@@ -513,6 +514,7 @@ def test_what_is_damaged_is_skipped_and_counted(browser: Browser) -> None:
     whole, element = make_source(), "document.documentElement.dataset"
     with running(Damaged(whole.parts, whole.quantizer, Fraction(20), whole.cameras)) as server:
         browser.open(f"{server.url}#camera=cam1", 480, 360)
+        browser.wait_for(f"{element}.frame !== undefined")  # before that, the page before may hear it
         browser.evaluate("window.seen = new Set(); new MutationObserver(() => seen.add("
                          f"{element}.frame)).observe(document.documentElement, {{ attributes: true }})")  # fmt: skip
         browser.wait_for("seen.has('5') && seen.has('7') && seen.has('0')", seconds=8)
@@ -520,3 +522,151 @@ def test_what_is_damaged_is_skipped_and_counted(browser: Browser) -> None:
         assert not browser.evaluate("seen.has('4') || seen.has('6')")
         assert browser.evaluate("document.getElementById('lost').textContent") == "2 of 8 frames skipped"
         assert browser.evaluate("document.getElementById('wait').hidden")
+
+
+def press(browser: Browser, key: str) -> None:
+    browser.evaluate(f"dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))")
+
+
+def shown_at(browser: Browser, server: ViewerServer, wish: str, width: int, height: int, frame: int) -> np.ndarray:
+    """The page's picture of a frame, float64 [H, W, 3] in [0, 1]."""
+    browser.open(f"{server.url}#{wish}", width, height)
+    browser.wait_for(f"document.documentElement.dataset.frame == {frame}")
+    return browser.picture().astype(np.float64) / 255
+
+
+@pytest.mark.slow
+def test_bands_of_view_dependence_are_drawn_one_by_one(browser: Browser) -> None:
+    source = replace(make_source(3), near=0.1)
+    camera, gaussians = source.cameras[1], source.quantizer.decode(source.parts[0].frame(0))
+    band = np.repeat([0, 1, 2, 3], [1, 3, 5, 7])  # of each coefficient
+    with running(source) as server:
+        for mask in (15, 1, 3, 7, 2, 4, 8):
+            wish = f"bare=1&play=0&frame=0&camera={camera.name}&background=0,0,0&bands={mask}"
+            shown = shown_at(browser, server, wish, camera.width, camera.height, 0)
+            kept = ((mask >> band) & 1).astype(np.float32)
+            drawn = render(replace(gaussians, sh=gaussians.sh * kept[:, None]), camera, options=NEAR)
+            error = shown - np.clip(drawn.colour.transpose(1, 2, 0), 0, 1)
+            assert -10 * np.log10(np.mean(error**2)) > 52, mask  # as with all bands
+
+
+@pytest.mark.slow
+def test_playback_turns_about_at_both_ends(browser: Browser) -> None:
+    whole, element = make_source(), "document.documentElement.dataset"
+    with running(replace(whole, rate=Fraction(6))) as server:  # slow enough to show every frame
+        browser.open(f"{server.url}#camera=cam1&ends=bounce", 320, 240)
+        browser.wait_for(f"{element}.frame !== undefined")
+        browser.evaluate("window.seen = []; new MutationObserver(() => { if (seen.at(-1) !== +" + element +
+                         ".frame) seen.push(+" + element + ".frame); })"
+                         ".observe(document.documentElement, { attributes: true })")  # fmt: skip
+        browser.wait_for("seen.join().match(/7,.*\\b0,.*\\b7/)")
+        seen = browser.evaluate("seen")
+        turns = np.flatnonzero(np.diff(np.sign(np.diff(seen)))) + 1
+        assert {seen[turn] for turn in turns} == {0, 7}
+        browser.evaluate("document.getElementById('ends').click()")
+        assert browser.evaluate("document.getElementById('ends').textContent") == "Once"
+        browser.wait_for(f"{element}.frame == 7 && document.getElementById('play').textContent == 'Play'")
+
+
+@pytest.mark.slow
+def test_a_link_gives_the_very_picture_again(browser: Browser) -> None:
+    with running(replace(make_source(1), near=0.1)) as server:
+        shown_at(browser, server, "bare=1&play=0&frame=2&camera=cam1", 320, 240, 2)
+        drag = "for (const [name, x] of [['pointerdown', 90], ['pointermove', 150], ['pointerup', 150]])" \
+               " document.getElementById('picture').dispatchEvent(new PointerEvent(name," \
+               " { clientX: x, clientY: 80, pointerId: 1, buttons: 1 }))"  # fmt: skip
+        browser.evaluate(f"Element.prototype.setPointerCapture = () => {{}}; {drag}")
+        press(browser, "b")
+        press(browser, "u")
+        browser.wait_for("location.hash.includes('view=')")
+        time.sleep(1)  # drawn
+        before = browser.picture()
+        again = browser.evaluate("location.hash")
+        assert "bands=1" in again
+        after = shown_at(browser, server, f"{again[1:]}&bare=1", 320, 240, 2)
+        assert np.abs(after - before / 255).max() <= 2 / 255  # nine digits
+        for bad in ("view=1,2,3", "view=" + ",".join(["0"] * 16), "view=x"):
+            shown_at(browser, server, f"play=0&frame=2&camera=cam1&{bad}", 320, 240, 2)
+
+
+@pytest.mark.slow
+def test_a_span_is_measured_between_the_points_that_are_clicked(browser: Browser) -> None:
+    source, camera = make_source(), make_ring(width=400, height=300)[0]
+    points = np.array([[-0.6, 0.1, 0.2], [0.7, -0.3, 0.4]])
+    scales, still_turned = np.full((2, 3), -2.5), np.array([[1.0, 0, 0, 0]] * 2)
+    values = points, scales, still_turned, np.full(2, OPACITY_RANGE[1]), np.zeros((2, 1, 3))
+    codes = source.quantizer.encode(Gaussians(*(value.astype(np.float32) for value in values)))
+    still = np.empty((0, 0, 3), np.uint16), np.empty((0, 0, codes.attributes.shape[1]), np.uint8)
+    part = Segment(0, codes, np.zeros(2, bool), *still)
+    placed = source.quantizer.decode(codes).means
+    seen = placed @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    with running(replace(source, parts=(part,), cameras=(camera,), near=0.1, metric=True)) as server:
+        shown_at(browser, server, "play=0&frame=0", camera.width, camera.height, 0)
+        press(browser, "m")
+        for x, y in pixels:
+            browser.evaluate("for (const name of ['pointerdown', 'click']) document.getElementById('picture')"
+                             f".dispatchEvent(new PointerEvent(name, {{ clientX: {x}, clientY: {y} }}))")  # fmt: skip
+        span = float(browser.evaluate("document.documentElement.dataset.span"))
+        assert span == pytest.approx(np.linalg.norm(placed[0] - placed[1]), rel=0.01)  # to a pixel, in half floats
+        assert browser.evaluate("document.querySelector('#ruler text').textContent").endswith(" m")
+        press(browser, "Escape")
+        assert browser.evaluate("document.getElementById('ruler').hasAttribute('hidden')")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height", "folded"), [(1280, 720, False), (844, 390, True), (390, 844, True)])
+def test_panels_fold_on_small_screens_and_nothing_hangs_out(
+    browser: Browser, width: int, height: int, folded: bool
+) -> None:
+    def inside(name: str) -> bool:
+        box = browser.evaluate(f"document.getElementById('{name}').getBoundingClientRect().toJSON()")
+        corners = box["left"] >= 0, box["top"] >= 0, box["right"] <= width, box["bottom"] <= height
+        return bool(box["width"]) and all(corners)
+
+    with running(make_source()) as server:
+        shown_at(browser, server, "play=0&frame=0", width, height, 0)
+        assert inside("bar")
+        assert inside("about")
+        assert inside("side") is not folded
+        assert browser.evaluate("document.getElementById('track').clientWidth") > 250
+        press(browser, "v")
+        assert inside("side") is folded
+
+
+@pytest.mark.slow
+def test_a_message_that_is_closed_stays_closed_until_there_is_another(browser: Browser) -> None:
+    class Stuck(SegmentSource):
+        def moving(self, frame: int) -> Codes:
+            if frame >= 2:
+                raise OSError("frame 2 will never come")
+            return super().moving(frame)
+
+    whole = make_source()
+    with running(Stuck(whole.parts, whole.quantizer, Fraction(20), whole.cameras)) as server:
+        browser.open(f"{server.url}#camera=cam1", 480, 360)
+        browser.wait_for("!document.getElementById('wait').hidden && !!document.querySelector('#wait.bad')")
+        browser.evaluate("document.getElementById('dismiss').click()")
+        assert browser.evaluate("document.getElementById('wait').hidden")
+        time.sleep(2)  # tried again meanwhile
+        assert browser.evaluate("document.querySelector('#wait.bad:not([hidden])') === null")
+
+
+def test_the_page_is_told_the_worst_frame_and_how_long_decoding_took() -> None:
+    with running(make_source()) as server:
+        server.worst = 6
+        assert json.loads(fetch(server, "/scene.json")[1])["worst"] == 6
+        assert re.fullmatch(r"decode;dur=\d+\.\d", fetch(server, "/frames/1.bin")[0].getheader("Server-Timing") or "")
+        server.worst = None
+        assert "worst" not in json.loads(fetch(server, "/scene.json")[1])
+
+
+def test_a_port_that_is_taken_is_named(scene_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ValueError, match=f"port {port} of 127.0.0.1 cannot be had: .*name another --port"):
+            serve(scene_path, port=port)
+    with pytest.raises(ValueError, match="--host must be an address of this machine"):
+        serve(scene_path, host="198.51.100.7")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipelines.cli import main
-from pipelines.commands.report import differences
+from tasks.report.compare import FIGURES, Difference, differences
 from tasks.report.facts import FrameScore, ReportInput
 from tasks.report.write import write_report
 
@@ -34,17 +37,45 @@ def test_two_runs_differ_in_what_was_set_what_came_and_what_is_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a = write_run(tmp_path / "a", 25.0)
-    b = write_run(tmp_path / "b", 18.5, options={"fit": {"iterations": 90}}, seconds=6.0)
+    b = write_run(
+        tmp_path / "b", 18.5, options={"fit": {"iterations": 90}}, seconds=6.0, stage_versions={"background": 9}
+    )
     assert main(["report", "--compare", str(a), str(b), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["differences"]
     told = {item["name"]: (item["a"], item["b"]) for item in found}
     assert told["fit.iterations"] == (900, 90)
     assert told["PSNR, dB"] == told["PSNR of cam1, dB"] == (25.0, 18.5)
+    assert told["background"] == (None, 9)
     assert told["total time, s"] == (60.0, 6.0)
     assert next(item["b"] for item in found if item["kind"] == "finding").startswith("The mean of 18.5 dB")
     one, two = (json.loads((folder / "report.json").read_text()) for folder in (a, b))
     there, back = list(differences(one, two)), list(differences(two, one))
     assert [(item.name, item.a, item.b) for item in there] == [(item.name, item.b, item.a) for item in back]
+
+
+def test_the_page_of_a_comparison_shows_what_differs_and_stands_alone(tmp_path: Path) -> None:
+    a, b = write_run(tmp_path / "a", 25.0, command="<b>"), write_run(tmp_path / "<i>b", 18.5, seconds=6.0)
+    page = tmp_path / "ab.html"
+    assert main(["report", "--compare", str(a), str(b), "--output", str(page)]) == 0
+    text = page.read_text()
+    assert text.count('class="verdict unjudged"') == text.count('class="verdict unfit"') == 1
+    assert "PSNR over time" in text
+    assert '<td class="bad">-6.5</td>' in text  # dB, which are lost
+    assert '<td class="good">-54</td>' in text  # seconds, which are gained
+    assert "iterations" not in text  # the same in both
+    assert "<i>b" not in text
+    assert not re.search(r"<script|<link|@import|url\(|https?://(?!www.w3.org/2000/svg)", text)
+    assert main(["report", "--compare", str(a), str(a), "--output", str(page)]) == 0
+    assert "Nothing differs" in page.read_text()
+    assert main(["report", str(a), "--output", str(page)]) == 2
+
+
+@given(st.floats(-50, 50), st.floats(-50, 50), st.sampled_from(sorted(FIGURES)))
+def test_what_is_better_there_is_worse_back(a: float, b: float, name: str) -> None:
+    there, back = (Difference("figure", FIGURES[name].told, *pair) for pair in ((a, b), (b, a)))
+    assert there.better == -back.better
+    assert Difference("figure", FIGURES[name].told, a, a).better == 0
+    assert Difference("figure", FIGURES[name].told, None, a).better == 0
 
 
 def test_a_data_set_lists_every_run_with_its_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -461,6 +461,44 @@ def test_still_places_that_rot_are_named() -> None:
         assert texts(replace(report, scores=scores)) == []
 
 
+def test_fitted_cameras_far_above_unseen_ones_at_the_same_frames_are_a_finding() -> None:
+    def beside(gap_db: float) -> ReportInput:
+        """Fitted cameras above the unseen ones by a gap, at three frames, of which one camera lacks one."""
+        unseen = {frame: np.mean([s.psnr_db for s in make_scores() if s.frame == frame]) for frame in (2, 6, 10)}
+        pairs = [("cam0", 2), ("cam0", 6), ("cam0", 10), ("cam5", 2), ("cam5", 10)]
+        own = tuple(FrameScore(camera, frame, unseen[frame] + gap_db, 0.95) for camera, frame in pairs)
+        return replace(make_report(), fitted=own)
+
+    near, far = beside(2.0), beside(9.0)
+    assert summary(near)["fitted_gap_db"] == pytest.approx(2.0)
+    assert summary(near)["fitted_cameras"] == ["cam0", "cam5"]
+    assert summary(near)["psnr_db"] == summary(make_report())["psnr_db"]
+    assert summary(make_report())["fitted_gap_db"] is None
+    assert findings(near) == findings(make_report())
+    (finding,) = set(findings(far)) - set(findings(near))
+    assert "9.0 dB of what was fitted is not there from elsewhere" in finding.text
+    assert finding.cure
+    assert finding not in findings(far, replace(LIMITS, fitted_gap_db=9.5))
+    for report in (near, far):
+        assert "cam0, cam5" in section(page_text(report), "quality")
+        assert len(report_json(report)["fitted"]) == 5
+    assert "Fitted beside unseen" not in page_text(replace(near, held_out=()))
+    assert "Fitted beside unseen" not in page_text(replace(near, scores=near.scores[:1]))  # no frame in common
+
+
+def test_versions_of_stages_are_listed_and_artefacts_made_otherwise_are_one_finding() -> None:
+    how = {"numpy 2.1.0, not 2.2.6": ("sync", "rig"), "another processor, a Z80": ("rig",)}
+    report = replace(make_report(), stage_versions={"sync": 31, "rig": 7}, otherwise=how)
+    page = section(page_text(report), "run")
+    assert "sync  31" in page
+    assert "rig   7" in page
+    (finding,) = set(findings(report)) - set(findings(make_report()))
+    assert finding.severity is Severity.NOTE
+    assert finding.evidence == ("sync, rig: made by numpy 2.1.0, not 2.2.6.", "rig: made by another processor, a Z80.")
+    run = report_json(report)["run"]
+    assert (run["stage_versions"], run["otherwise"]) == ({"sync": 31, "rig": 7}, {k: list(v) for k, v in how.items()})
+
+
 def test_scores_without_areas_show_none() -> None:
     report = make_report()
     assert "Where the error lies" not in Page(page_text(report)).words
