@@ -27,8 +27,8 @@ from tests.support.places import ROOT
 def test_the_cuda_kernels_do_what_the_cpus_do_in_the_simulator():
     """In an interpreter of its own, since numba reads the switch when it is imported."""
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": str(ROOT)}
-    tests = ["tests/packuv/raster/test_cuda.py", "tests/packuv/fit/test_cuda.py"]
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *tests]
+    tests = ["raster/test_cuda.py", "fit/test_cuda.py", "fit/test_rows_cuda.py"]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"tests/packuv/{test}" for test in tests)]
     environment.pop("PACKUV_REQUIRE", None)
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr
