@@ -53,7 +53,8 @@ class SolverOptions(LossOptions):
     shows must then be covered, and no camera can be explained by leaving a place half transparent"""
     seed: int = 0
     device: str = "cpu"
-    """Who renders, compares and labels: "cpu", or "cuda" (see `packuv.fit.device`); the CPU does the rest either way"""
+    """Who renders, compares, steps and labels: "cpu", or "cuda", where iterations stay from the first to the last (see
+    `packuv.fit.device` and `packuv.fit.resident`)"""
     density: DensityOptions = field(default_factory=DensityOptions)
     rates: Rates = field(default_factory=Rates)
     uv: UvOptions = field(default_factory=UvOptions)
