@@ -113,8 +113,12 @@ class Stage(ABC):
         """What its job takes there, roughly: the memory is that of the site and what any program takes."""
         if self.small:
             return Needs(1, BASE_BYTES)
-        on_gpu = any(getattr(value, "device", "cpu") == "cuda" for value in self.settings.values())
-        return Needs(site.threads, site.memory_bytes + BASE_BYTES, int(on_gpu))
+        return Needs(site.threads, site.memory_bytes + BASE_BYTES, int(self.on_gpu))
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether its options say so."""
+        return any(getattr(value, "device", "cpu") == "cuda" for value in self.settings.values())
 
     def spared(self, folder: Path, notes: Notes) -> Iterable[tuple[str, str]]:
         """Work that this sequence did not need, as (what, why), told by the artefact."""
@@ -149,7 +153,8 @@ class StageJob:
         return self.stage.label
 
     def __call__(self, progress: Progress) -> Notes:
-        return self.stage.build(Work(self.site, self.out, self.scratch, progress))
+        notes = self.stage.build(Work(self.site, self.out, self.scratch, progress))
+        return {**notes, "device": "cuda"} if self.stage.on_gpu else notes
 
 
 def _names_artefacts(value: Any) -> bool:

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from packuv.fit.options import FitOptions
+from packuv.progress import no_progress
 from tasks.artefacts.jobs import JobDiedError, JobError
-from tasks.artefacts.stage import Needs, Site, Stage
+from tasks.artefacts.recipe import plain, restore
+from tasks.artefacts.stage import Needs, Site, Stage, StageJob
 from tasks.artefacts.store import Store
 from tasks.cluster.orders import Seen, fulfil, offered, order, read, resources
 from tests.support.naps import Nap
@@ -23,7 +26,7 @@ class Options:
 @dataclass(frozen=True, kw_only=True)
 class Fit(Stage):
     name, version = "fit", 1
-    options: Options
+    options: Options | FitOptions
 
     def build(self, work):
         return {}
@@ -125,3 +128,18 @@ def test_a_stage_says_what_it_needs(site):
     assert on_gpu.fits(Needs(4, 3_000_000_000, 1))
     for small in (Needs(2, 9_000_000_000, 1), Needs(4, 2_000_000_000, 1), Needs(4, 9_000_000_000)):
         assert not on_gpu.fits(small)
+
+
+def test_a_gpu_names_no_artefact_but_its_receipt_says_so(site):
+    """A run that loses its GPU goes on with what is there."""
+    cpu, cuda = (Fit(options=FitOptions(device=device)) for device in ("cpu", "cuda"))
+    store = Store(site.store)
+    assert store.key("fit", 1, cpu.settings, {}) == store.key("fit", 1, cuda.settings, {})
+    assert store.key("fit", 1, cpu.settings, {}) != store.key("fit", 1, {"options": FitOptions(seed=1)}, {})
+    notes = [StageJob(stage, site, Path("out"), Path("scratch"))(no_progress) for stage in (cpu, cuda)]
+    assert notes == [{}, {"device": "cuda"}]
+
+
+def test_the_device_still_travels_with_an_order():
+    assert plain(FitOptions(device="cuda"))["device"] == "cuda"
+    assert restore(FitOptions, plain(FitOptions(device="cuda"))) == FitOptions(device="cuda")
