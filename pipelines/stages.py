@@ -360,8 +360,8 @@ class Sequence:
         """With LPIPS, where the file of weights and the package for it are there."""
         scene, named = self.made.only("encode"), self.options.evaluate.lpips_weights
         weights = Path(named).resolve() if named else None
-        why = lacking(weights)
+        why, device = lacking(weights), self.options.fit.device
         if why or weights is None:
-            return Evaluate(take=take, scene=scene, no_lpips=why)
+            return Evaluate(take=take, scene=scene, no_lpips=why, device=device)
         backbone = self.workshop.files({"backbone": weights}, "evaluate")
-        return Evaluate(take=take, scene=scene, backbone=backbone, weights=str(weights))
+        return Evaluate(take=take, scene=scene, backbone=backbone, weights=str(weights), device=device)

@@ -117,8 +117,8 @@ class Stage(ABC):
 
     @property
     def on_gpu(self) -> bool:
-        """Whether its options say so."""
-        return any(getattr(value, "device", "cpu") == "cuda" for value in self.settings.values())
+        """Whether it or its options say so."""
+        return "cuda" in (getattr(value, "device", "cpu") for value in (self, *self.settings.values()))
 
     def spared(self, folder: Path, notes: Notes) -> Iterable[tuple[str, str]]:
         """Work that this sequence did not need, as (what, why), told by the artefact."""
