@@ -16,7 +16,7 @@ import torch
 from packuv.camera import PinholeCamera
 from packuv.fit import device
 from packuv.fit.backdrop import Backdrop, joined
-from packuv.fit.device import choose_device, drawn_differently, obstacle
+from packuv.fit.device import choose_device, drawn_differently, gpu_is_full, obstacle
 from packuv.gaussians.floats import Gaussians, rows_of
 from packuv.raster import render
 from tests.support.dense_raster import OPTIONS, camera, scene
@@ -84,6 +84,13 @@ def test_a_backdrop_has_layers():
     assert np.abs(drawn.colour - plain.colour).max() < 2e-4
     nothing = rows_of(scene(4), slice(0, 0))
     assert Backdrop(nothing, OPTIONS.near).layer(camera(), None) is None
+
+
+def test_used_up_memory_is_told_from_other_errors():
+    assert gpu_is_full(torch.OutOfMemoryError("CUDA out of memory."))
+    assert gpu_is_full(RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY"))
+    assert not gpu_is_full(RuntimeError("[700] Call to cuCtxSynchronize results in CUDA_ERROR_ILLEGAL_ADDRESS"))
+    assert not gpu_is_full(MemoryError())
 
 
 def test_without_numba_cuda_the_cpu_does_everything(monkeypatch):
