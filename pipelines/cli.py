@@ -566,6 +566,7 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="torchvision's AlexNet or VGG-16 weights, to measure LPIPS",
     )
+    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
     _json(command)
 
 

@@ -367,8 +367,8 @@ class Sequence:
         scene, named = self.made.only("encode"), self.options.evaluate.lpips_weights
         beside = cameras_beside(self.placed, self.options.evaluate)
         weights = Path(named).resolve() if named else None
-        why = lacking(weights)
+        why, device = lacking(weights), self.options.fit.device
         if why or weights is None:
-            return Evaluate(take=take, beside=beside, scene=scene, no_lpips=why)
+            return Evaluate(take=take, beside=beside, scene=scene, no_lpips=why, device=device)
         backbone = self.workshop.files({"backbone": weights}, "evaluate")
-        return Evaluate(take=take, beside=beside, scene=scene, backbone=backbone, weights=str(weights))
+        return Evaluate(take=take, beside=beside, scene=scene, backbone=backbone, weights=str(weights), device=device)

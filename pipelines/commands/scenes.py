@@ -222,11 +222,15 @@ def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
 
 def evaluate(arguments: argparse.Namespace) -> int:
     """`packuv eval`: every frame against what cameras filmed, by the definitions of docs/scores.md."""
+    from packuv.fit.device import choose_device
     from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
 
+    device = choose_device(arguments.device)
     options = EvaluateOptions(lpips_weights=arguments.lpips_weights)
     with shown(arguments, "evaluate") as progress:
-        facts = evaluate_scene(arguments.scene, arguments.capture, arguments.cameras, options, progress=progress)
+        facts = evaluate_scene(
+            arguments.scene, arguments.capture, arguments.cameras, options, progress=progress, device=device
+        )
     print_facts(facts, arguments.json, _scores_text)
     return 0
 
