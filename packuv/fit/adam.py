@@ -118,8 +118,10 @@ def corrections(beta1: float, beta2: float) -> np.ndarray:
 
 @kernel(inline=True, fastmath=_FAST)
 def moved(g, first, second, rate, lift1, lift2, keep1, add1, keep2, add2, epsilon):
-    """The moments after a gradient, and by how much the parameter falls, on the CPU and on a GPU; `lift` of both moments
-    is what they lack at this step."""
+    """The moments after a gradient, and by how much the parameter falls, on the CPU and on a GPU.
+
+    The lifts are factors of what the first moment and the second's root lack at this step, see `corrections`.
+    """
     m = keep1 * first + add1 * g
     v = keep2 * second + add2 * g * g
     root = math.sqrt(v) * lift2 + epsilon
