@@ -117,24 +117,28 @@ def corrections(beta1: float, beta2: float) -> np.ndarray:
 
 
 @kernel(inline=True, fastmath=_FAST)
-def step_row(parameters, gradient, first, second, steps, rates, corrections, keep1, add1, keep2, add2, epsilon, i):
-    """One step of row i, on the CPU and on a GPU."""
-    steps[i] += 1
-    step = min(steps[i], corrections.shape[0] - 1)
-    for k in range(parameters.shape[1]):
-        g = gradient[i, k]
-        m = keep1 * first[i, k] + add1 * g
-        v = keep2 * second[i, k] + add2 * g * g
-        first[i, k], second[i, k] = m, v
-        root = math.sqrt(v) * corrections[step, 1] + epsilon
-        parameters[i, k] -= rates[k] * corrections[step, 0] * m / root
+def moved(g, first, second, rate, lift1, lift2, keep1, add1, keep2, add2, epsilon):
+    """The moments after a gradient, and by how much the parameter falls, on the CPU and on a GPU.
+
+    The lifts are factors of what the first moment and the second's root lack at this step, see `corrections`.
+    """
+    m = keep1 * first + add1 * g
+    v = keep2 * second + add2 * g * g
+    root = math.sqrt(v) * lift2 + epsilon
+    return m, v, rate * lift1 * m / root
 
 
 @kernel(parallel=True, fastmath=_FAST)
 def _step(parameters, gradient, first, second, steps, rates, rows, corrections, keep1, add1, keep2, add2, epsilon):
-    count = parameters.shape[0]
+    count, columns = parameters.shape
     for chunk in prange(_CHUNKS):
         for i in range(count * chunk // _CHUNKS, count * (chunk + 1) // _CHUNKS):
-            if rows[i] != 0:
-                step_row(parameters, gradient, first, second, steps, rates, corrections, keep1, add1, keep2, add2,
-                         epsilon, i)  # fmt: skip
+            if rows[i] == 0:
+                continue
+            steps[i] += 1
+            step = min(steps[i], corrections.shape[0] - 1)
+            for k in range(columns):
+                m, v, fall = moved(gradient[i, k], first[i, k], second[i, k], rates[k], corrections[step, 0],
+                                   corrections[step, 1], keep1, add1, keep2, add2, epsilon)  # fmt: skip
+                first[i, k], second[i, k] = m, v
+                parameters[i, k] -= fall

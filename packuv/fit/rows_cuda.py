@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from packuv.fit.adam import AdamOptions, AdamState, corrections, factors, step_row
+from packuv.fit.adam import AdamOptions, AdamState, corrections, factors, moved
 from packuv.fit.guard import GRADIENT_LIMIT, VALUE_LIMITS, copy_row, fault_of_gradients, fault_of_values
 from packuv.fit.model import Model, Rates
 from packuv.gaussians.codes import Codes, Quantizer, decode_row, encode_row
@@ -157,8 +157,19 @@ def _array(tensor: Tensor) -> np.ndarray:
     return np.array(tensor.cpu().numpy())
 
 
-_step_row, _fault_of_values, _fault_of_gradients = map(shared, (step_row, fault_of_values, fault_of_gradients))
+_moved, _fault_of_values, _fault_of_gradients = map(shared, (moved, fault_of_values, fault_of_gradients))
 _copy_row, _encode_row, _decode_row = map(shared, (copy_row, encode_row, decode_row))
+
+
+@cuda.jit(device=True)
+def _step_row(parameters, gradient, first, second, steps, rates, corrections, keep1, add1, keep2, add2, epsilon, i):
+    steps[i] += 1
+    step = min(steps[i], corrections.shape[0] - 1)
+    for k in range(parameters.shape[1]):
+        m, v, fall = _moved(gradient[i, k], first[i, k], second[i, k], rates[k], corrections[step, 0],
+                            corrections[step, 1], keep1, add1, keep2, add2, epsilon)  # fmt: skip
+        first[i, k], second[i, k] = m, v
+        parameters[i, k] -= fall
 
 
 @cuda.jit
