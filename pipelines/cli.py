@@ -582,6 +582,9 @@ def _report(command: argparse.ArgumentParser) -> None:
 def _view(command: argparse.ArgumentParser) -> None:
     _scene(command)
     command.add_argument("--port", type=int, default=8787, help="TCP port; 0 picks a free one")
+    command.add_argument(
+        "--capture", type=Path, metavar="DIR", help="lay what its cameras filmed beside (the run's, where it is known)"
+    )
     command.add_argument("--host", default="127.0.0.1", help="address to answer at; 0.0.0.0 shows it to everyone")
 
 

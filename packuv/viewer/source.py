@@ -90,6 +90,16 @@ class Source(Protocol):
         """The D dynamic rows of a frame."""
 
 
+class Truth(Protocol):
+    """What cameras filmed, to lay beside a scene; any thread asks."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]: ...
+
+    def picture(self, camera: str, frame: int) -> np.ndarray | None:
+        """uint8 [H, W, 3], RGB: undistorted, in the scene's colours and the light of the frame; None without one."""
+
+
 @dataclass(frozen=True)
 class SegmentSource:
     """Fitted segments in memory, before there is a scene file."""

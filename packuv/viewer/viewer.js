@@ -18,6 +18,8 @@ const player = {
   stalled: false, stalledAt: 0, stalls: 0,
 };
 const ENDS = { loop: "Loop", bounce: "Ping-pong", stop: "Once" }; // what happens at the last frame
+const TRUTHS = ["", "beside", "over", "minus"];
+const truth = { mode: "", loading: "", shown: "" }; // addresses of pictures
 const ruler = { on: false, points: [] }; // world
 const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
 const meter = { drawn: 0, frames: 0, since: performance.now(), sort_ms: 0, count: 0, moving: 0, seen: new Set() };
@@ -189,6 +191,7 @@ function drawPicture() {
   meter.drawn++;
   drawRuler();
   outline(view.frame);
+  placeTruth(view.frame);
   showLegend();
   if (player.shown >= 0) document.documentElement.dataset.frame = player.shown; // for automation
 }
@@ -210,6 +213,45 @@ function outline([left, top, width, height]) {
   for (const button of at("cameras").children) {
     button.setAttribute("aria-current", String(button.dataset.camera === navigation.exact));
   }
+}
+
+// ---- what was filmed
+
+// The picture of the capture camera whose very view this is, over the outline of its picture or beside it.
+function placeTruth([left, top, width, height]) {
+  const camera = navigation.jump ? null : navigation.exact, picture = at("truth");
+  const filmed = truth.mode && player.shown >= 0 && scene.truth?.includes(camera);
+  picture.hidden = !filmed || !truth.shown.startsWith(`truth/${encodeURIComponent(camera)}/`);
+  if (!filmed) return;
+  const density = canvas.width / canvas.clientWidth, aside = truth.mode === "beside" ? canvas.clientWidth : 0;
+  const sides = { left: left / density + aside, top: top / density, width: width / density, height: height / density };
+  for (const [side, value] of Object.entries(sides)) picture.style[side] = `${value}px`;
+  picture.style.opacity = truth.mode === "over" ? at("share").value : 1;
+  fetchTruth(`truth/${encodeURIComponent(camera)}/${player.shown}.png`);
+}
+
+function fetchTruth(address) { // one at a time; what plays on meanwhile is shown next
+  if (truth.loading || truth.shown === address) return;
+  truth.loading = address;
+  const next = new Image();
+  next.src = address;
+  const settle = (found) => {
+    truth.loading = "";
+    truth.shown = found ? address : `${address} is not there`;
+    if (found) at("truth").src = next.src;
+    else at("truth").removeAttribute("src");
+    document.documentElement.dataset.truth = truth.shown; // for automation
+    dirty = true;
+  };
+  next.decode().then(() => settle(true), () => settle(false));
+}
+
+function setTruth(mode) {
+  truth.mode = scene.truth ? mode : "";
+  at("compare").value = truth.mode;
+  for (const name of TRUTHS.filter(Boolean)) document.body.classList.toggle(name, name === truth.mode);
+  at("share-row").hidden = truth.mode !== "over";
+  dirty = true;
 }
 
 function drawMarks() {
@@ -311,6 +353,7 @@ function fillPage() {
   at("cameras-head").hidden = !scene.cameras.length;
   for (const [name, mask] of bandsOf(scene.sh_degree)) at("bands").append(new Option(name, mask));
   at("bands-row").hidden = !scene.sh_degree;
+  at("truth-row").hidden = !scene.truth;
   grantWish();
   setPlaying(player.playing);
   setNear(0);
@@ -322,6 +365,7 @@ function grantWish() {
   if (wish.has("view")) navigation.recall(wish.get("view").split(",").map(Number));
   if (wish.has("bands")) setBands(Number(wish.get("bands")) || 0);
   if (ENDS[wish.get("ends")]) setEnds(wish.get("ends"));
+  if (TRUTHS.includes(wish.get("truth"))) setTruth(wish.get("truth"));
   if (MODES.includes(wish.get("mode"))) setMode(wish.get("mode"));
   if (wish.has("scale")) setScale(Number(wish.get("scale")) || 1);
   if (wish.has("background")) look.background = wish.get("background").split(",").map(Number);
@@ -440,6 +484,7 @@ function linkHere() {
   now.set(...(navigation.exact ? ["camera", navigation.exact] : ["view", numbers.join(",")]));
   now.set("background", look.background.join(","));
   if (look.lines) now.set("cameras", 1);
+  if (truth.mode) now.set("truth", truth.mode);
   history.replaceState(null, "", `#${now}`);
   const told = () => notice("This page's address now shows this very view.");
   if (!navigator.clipboard) return told();
@@ -503,6 +548,7 @@ const KEYS = {
   i: () => at("stats").toggleAttribute("hidden"),
   m: () => setMeasuring(!ruler.on),
   p: savePicture,
+  t: () => setTruth(cycle(TRUTHS, truth.mode)),
   u: linkHere,
   v: () => setFolded(!document.body.classList.contains("folded")),
   x: () => { if (scene.worst !== undefined) { pause(); seek(scene.worst); } },
@@ -550,6 +596,8 @@ function listen() {
   at("back").onclick = () => KEYS.ArrowLeft({});
   at("forth").onclick = () => KEYS.ArrowRight({});
   at("bands").onchange = (event) => setBands(Number(event.target.value));
+  at("compare").onchange = (event) => setTruth(event.target.value);
+  at("share").oninput = (event) => { at("share-value").textContent = Number(event.target.value).toFixed(2); dirty = true; };
   at("measure").onclick = KEYS.m;
   at("link").onclick = linkHere;
   at("shot").onclick = savePicture;

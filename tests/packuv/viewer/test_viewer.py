@@ -19,6 +19,7 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -670,3 +671,64 @@ def test_a_port_that_is_taken_is_named(scene_path: Path) -> None:
             serve(scene_path, port=port)
     with pytest.raises(ValueError, match="--host must be an address of this machine"):
         serve(scene_path, host="198.51.100.7")
+
+
+class Drawn:
+    """Pictures of which the viewer's own should differ by rounding alone; of a camera and frame there is none."""
+
+    cameras = ("cam0", "cam1", "ca/m ü")
+
+    def __init__(self, source: SegmentSource) -> None:
+        self._source = source
+
+    def picture(self, camera: str, frame: int) -> np.ndarray | None:
+        if camera != "cam1" or frame == 3:
+            return None
+        gaussians = self._source.quantizer.decode(self._source.parts[0].frame(frame))
+        background = (0.2, 0.4, 0.6)
+        drawn = render(gaussians, self._source.cameras[1], options=NEAR, background=background).colour
+        pixels: np.ndarray = np.rint(255 * np.clip(drawn, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
+        return pixels
+
+
+def test_what_was_filmed_is_served_exactly_and_only_where_there_is_something() -> None:
+    source = make_source()
+    with running(source) as server:
+        assert "truth" not in json.loads(fetch(server, "/scene.json")[1])
+        assert fetch(server, "/truth/cam1/0.png")[0].status == 404
+        truth = Drawn(source)
+        server.truth = truth
+        assert json.loads(fetch(server, "/scene.json")[1])["truth"] == list(truth.cameras)
+        answer, body = fetch(server, "/truth/cam1/2.png")
+        assert (answer.status, answer.getheader("Content-Type")) == (200, "image/png")
+        shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        assert np.array_equal(shown, truth.picture("cam1", 2))
+        for path in ("cam1/3.png", "cam1/8.png", "cam9/0.png", "ca%2Fm%20%C3%BC/0.png", "cam1/00.png", "../x/0.png"):
+            assert fetch(server, f"/truth/{path}")[0].status == 404
+
+
+@pytest.mark.slow
+def test_what_was_filmed_lies_beside_over_and_minus_the_render(browser: Browser) -> None:
+    source = replace(make_source(), near=0.1)
+    camera, element = source.cameras[1], "document.documentElement.dataset"
+
+    def page(mode: str, width: int, height: int, frame: int = 2) -> np.ndarray:
+        wish = f"bare=1&play=0&frame={frame}&camera=cam1&background=0.2,0.4,0.6&truth={mode}"
+        shown_at(browser, server, wish, width, height, frame)
+        browser.wait_for(f"{element}.truth !== undefined")
+        time.sleep(0.5)  # drawn
+        return browser.picture().astype(np.float64)
+
+    with running(source) as server:
+        server.truth = Drawn(source)
+        filmed = server.truth.picture("cam1", 2)
+        assert filmed is not None
+        assert page("minus", camera.width, camera.height).mean() < 4 * 0.5  # four times brighter; rounding to 8 bits
+        both = page("beside", 2 * camera.width, camera.height)
+        left, right = both[:, : camera.width], both[:, camera.width :]
+        assert np.abs(right - filmed).max() <= 1
+        assert np.abs(left - filmed).mean() < 0.5
+        assert np.abs(page("over", camera.width, camera.height) - filmed).mean() < 0.5
+        page("over", camera.width, camera.height, frame=3)
+        assert browser.evaluate(f"{element}.truth") == "truth/cam1/3.png is not there"
+        assert browser.evaluate("document.getElementById('truth').hidden || !document.getElementById('truth').src")
