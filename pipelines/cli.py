@@ -221,6 +221,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _atlas(command("atlas", "pipelines.commands.exchange:atlas", "write the UV atlas of a frame as a picture"))
     _web(command("web", "pipelines.commands.exchange:web", "write a scene as static files for any web server"))
     _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
+    _film(command("film", "pipelines.commands.scenes:film", "write an MP4 of a scene along a camera path"))
     _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
     _serve(command("serve", "pipelines.commands.serve:serve", "keep a dashboard, and run by form, script or schedule"))
     _worker(command("worker", "pipelines.commands.worker:worker", "make stages here for runs with --cluster"))
@@ -551,6 +552,15 @@ def _render(command: argparse.ArgumentParser) -> None:
     command.add_argument("--size", type=_size, default=None, metavar="WxH", help="picture size, pixels (the camera's)")
     command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for 000000.png, ...")
+
+
+def _film(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    command.add_argument("path", type=Path, metavar="PATH.json", help="a camera path, as the viewer writes it")
+    command.add_argument("--size", type=_size, default=None, metavar="WxH", help="picture size, pixels (first view's)")
+    command.add_argument("--fps", type=_rate, default=None, metavar="N", help="pictures per second (the scene's)")
+    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
+    _output(command, "FILE.mp4", "the film")
 
 
 def _evaluate(command: argparse.ArgumentParser) -> None:

@@ -3,6 +3,7 @@
 import { DEPTH_STOPS, MODES, SplatView } from "./splats.js";
 import { Navigation, frusta, worldOf } from "./navigation.js";
 
+const VIEW_SECONDS = 2; // of a camera path, from view to view at least
 const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
 const STALL_NOTICE_MS = 250;
 const HERE = 1, LOST = 2; // what the worker says of a frame; 0 is on its way
@@ -20,6 +21,7 @@ const player = {
 const ENDS = { loop: "Loop", bounce: "Ping-pong", stop: "Once" }; // what happens at the last frame
 const TRUTHS = ["", "beside", "over", "minus"];
 const truth = { mode: "", loading: "", shown: "" }; // addresses of pictures
+const path = []; // views of a camera path, as packuv.film reads them
 const ruler = { on: false, points: [] }; // world
 const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
 const meter = { drawn: 0, frames: 0, since: performance.now(), sort_ms: 0, count: 0, moving: 0, seen: new Set() };
@@ -491,6 +493,35 @@ function linkHere() {
   navigator.clipboard.writeText(location.href).then(() => notice("The link to this view is copied."), told);
 }
 
+// Some seconds from view to view, or what the scene takes between their frames.
+function addView() {
+  const last = path.at(-1), frame = Math.max(0, player.shown);
+  const apart = last && Math.max(VIEW_SECONDS, Math.abs(scene.times_ns[frame] - scene.times_ns[last.frame]) / 1e9);
+  const { width, height, ...camera } = navigation.camera();
+  const whole = { width: Math.round(width), height: Math.round(height) };
+  path.push({ seconds: last ? last.seconds + apart : 0, frame, camera: { ...camera, ...whole } });
+  tellPath();
+}
+
+function takeBack() {
+  path.pop();
+  tellPath();
+}
+
+function tellPath() {
+  const { length } = path;
+  at("path-count").textContent = length ? `${length} view${length > 1 ? "s" : ""}, ${path.at(-1).seconds.toFixed(1)} s` : "no view";
+  at("path-save").disabled = !length;
+}
+
+function pathText() { return JSON.stringify({ format: "packuv-path", version: 1, scene: scene.name, views: path }, null, 1); }
+
+function savePath() {
+  if (!path.length) return notice("The camera path has no view yet; K adds one.");
+  document.documentElement.dataset.path = pathText(); // for automation
+  save(`${scene.name.replace(/\.\w+$/, "")}_path.json`, new Blob([pathText()], { type: "application/json" }));
+}
+
 function savePicture() {
   drawPicture();
   const name = `${scene.name.replace(/\.\w+$/, "")}_${String(player.shown).padStart(6, "0")}.png`;
@@ -547,6 +578,9 @@ const KEYS = {
   b: () => { if (scene.sh_degree) cycleBands(); },
   i: () => at("stats").toggleAttribute("hidden"),
   m: () => setMeasuring(!ruler.on),
+  k: addView,
+  Backspace: takeBack,
+  j: savePath,
   p: savePicture,
   t: () => setTruth(cycle(TRUTHS, truth.mode)),
   u: linkHere,
@@ -598,6 +632,8 @@ function listen() {
   at("bands").onchange = (event) => setBands(Number(event.target.value));
   at("compare").onchange = (event) => setTruth(event.target.value);
   at("share").oninput = (event) => { at("share-value").textContent = Number(event.target.value).toFixed(2); dirty = true; };
+  at("path-add").onclick = addView;
+  at("path-save").onclick = savePath;
   at("measure").onclick = KEYS.m;
   at("link").onclick = linkHere;
   at("shot").onclick = savePicture;

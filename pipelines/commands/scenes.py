@@ -197,6 +197,22 @@ def render(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def film(arguments: argparse.Namespace) -> int:
+    """`packuv film`: one MP4 along a camera path."""
+    from packuv.film import CameraPath
+    from packuv.film import film as shoot
+    from packuv.fit.device import choose_device
+    from packuv.scene import open_scene
+
+    if arguments.output.suffix.lower() != ".mp4":
+        raise ValueError(f"the film becomes an MP4, so its name must end with .mp4, but is {arguments.output.name}")
+    path, device = CameraPath.load(arguments.path), choose_device(arguments.device)
+    with open_scene(arguments.scene) as scene, shown(arguments, "film") as progress:
+        count = shoot(scene, path, arguments.output, progress, rate=arguments.fps, size=arguments.size, device=device)
+    print(f"{arguments.output}: {count} pictures, {path.seconds:g} s, {len(path.views)} views")
+    return 0
+
+
 def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
     """A camera of the scene by name, or one from a JSON file in the scene's own form."""
     from packuv.bounds import fields

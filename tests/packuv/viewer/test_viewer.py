@@ -27,6 +27,7 @@ from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
 from packuv.colour import lit
+from packuv.film import CameraPath
 from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
@@ -732,3 +733,26 @@ def test_what_was_filmed_lies_beside_over_and_minus_the_render(browser: Browser)
         page("over", camera.width, camera.height, frame=3)
         assert browser.evaluate(f"{element}.truth") == "truth/cam1/3.png is not there"
         assert browser.evaluate("document.getElementById('truth').hidden || !document.getElementById('truth').src")
+
+
+@pytest.mark.slow
+def test_the_page_writes_camera_paths_that_films_read(browser: Browser, tmp_path: Path) -> None:
+    source, element = make_source(), "document.documentElement.dataset"
+    with running(source) as server:
+        shown_at(browser, server, "play=0&frame=2&camera=cam1", 320, 240, 2)
+        press(browser, "k")
+        press(browser, "]")
+        press(browser, "End")
+        browser.wait_for(f"{element}.frame == 7")
+        browser.wait_for("document.querySelector('#cameras [aria-current=true]').dataset.camera == 'cam2'")
+        time.sleep(1)  # it has flown there
+        for key in ("k", "k", "Backspace", "j"):
+            press(browser, key)
+        (tmp_path / "path.json").write_text(browser.evaluate(f"{element}.path"))
+    path = CameraPath.load(tmp_path / "path.json")
+    assert [(view.seconds, view.frame) for view in path.views] == [(0, 2), (2, 7)]
+    for view, camera in zip(path.views, source.cameras[1:3], strict=True):
+        wanted = camera.to_json()
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):
+            assert getattr(view.camera, name) == pytest.approx(wanted[name])
+        assert np.allclose(view.camera.camera_from_world, camera.camera_from_world, atol=1e-9)
