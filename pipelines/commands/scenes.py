@@ -305,6 +305,8 @@ def view(arguments: argparse.Namespace) -> int:
 
     folder = arguments.scene.parent
     worst, capture = _worst_frame(folder), arguments.capture or _capture_of(folder)
+    if capture and not capture.is_dir():
+        raise FileNotFoundError(f"no capture folder {capture}; name the one that the scene was made from, or none")
     if arguments.host not in LOOPBACK:
         told = f"packuv: everyone who can reach {arguments.host} sees this scene, without a password; end with Ctrl-C"
         print(told, file=sys.stderr)
