@@ -25,7 +25,17 @@ from urllib.parse import unquote
 
 import cv2
 
-from packuv.viewer.source import Source, Truth, describe, frame_bytes, key_bytes, open_source, tables_bytes
+from packuv.gaussians.uvsize import UvOptions
+from packuv.viewer.source import (
+    Source,
+    Truth,
+    describe,
+    frame_bytes,
+    key_bytes,
+    layer_bytes,
+    open_source,
+    tables_bytes,
+)
 
 PAGES = {
     "/": ("page.html", "text/html; charset=utf-8"),
@@ -38,7 +48,7 @@ PAGES = {
 
 BINARY = "application/octet-stream"
 PICTURE = re.compile(r"/truth/([^/]{1,600})/(0|[1-9][0-9]{0,8})\.png")
-NUMBERED = re.compile(r"/(segments|frames)/(0|[1-9][0-9]{0,8})\.bin")
+NUMBERED = re.compile(r"/(segments|frames|layers)/(0|[1-9][0-9]{0,8})\.bin")
 
 POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """Content security policy: a page that tries to reach another origin fails at once"""
@@ -137,7 +147,8 @@ class ViewerServer(ThreadingHTTPServer):
         if path == "/scene.json":
             marked = {} if self.worst is None else {"worst": self.worst}
             filmed = {"truth": list(self.truth.cameras)} if self.truth else {}
-            return json.dumps({**describe(self.source), **marked, **filmed}).encode(), "application/json"
+            told = {**describe(self.source), **marked, **filmed, "layers": UvOptions.layers}
+            return json.dumps(told).encode(), "application/json"
         if path == "/tables.bin":
             return self.tables(), BINARY
         if asked := PICTURE.fullmatch(path):
@@ -155,7 +166,7 @@ class ViewerServer(ThreadingHTTPServer):
         return written.tobytes(), "image/png"
 
     def _numbered(self, what: str, number: int) -> tuple[bytes, str] | None:
-        build = key_bytes if what == "segments" else frame_bytes
+        build = {"segments": key_bytes, "frames": frame_bytes, "layers": layer_bytes}[what]
         try:
             with self.reading:
                 return build(self.source, number), BINARY

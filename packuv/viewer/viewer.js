@@ -22,6 +22,7 @@ const ENDS = { loop: "Loop", bounce: "Ping-pong", stop: "Once" }; // what happen
 const TRUTHS = ["", "beside", "over", "minus"];
 const truth = { mode: "", loading: "", shown: "" }; // addresses of pictures
 const path = []; // views of a camera path, as packuv.film reads them
+const layered = { shown: -1, asked: -1 }; // segments
 const ruler = { on: false, points: [] }; // world
 const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
 const meter = { drawn: 0, frames: 0, since: performance.now(), sort_ms: 0, count: 0, moving: 0, seen: new Set() };
@@ -53,6 +54,12 @@ const receive = {
     Object.assign(buffer, { map, ahead });
     drawMarks();
   },
+  layers({ segment, layers }) {
+    if (segment !== layered.shown) return;
+    splats.setLayers(layers);
+    document.documentElement.dataset.layers = segment; // for automation
+    dirty = true;
+  },
   miss() { waiting = false; stale = false; },
   picture(message) {
     waiting = false;
@@ -60,6 +67,8 @@ const receive = {
     if (message.frame_codes) splats.setFrame(message.frame_codes.packed, message.frame_codes.rows);
     splats.setOrder(message.order, message.visible);
     spare = message.order.buffer;
+    layered.shown = message.segment;
+    if (look.mode === "layer") askLayers();
     settleRange(message.range, message.frame !== player.shown && player.shown >= 0);
     if (message.frame !== player.shown) meter.frames++;
     player.shown = message.frame;
@@ -87,6 +96,13 @@ function ask() {
   spare = null;
   waiting = true;
   stale = false;
+}
+
+// Layers of the UV map are told once for each segment on screen, and only to who looks at them.
+function askLayers() {
+  if (layered.asked === layered.shown || layered.shown < 0) return;
+  layered.asked = layered.shown;
+  worker.postMessage({ type: "layers" });
 }
 
 function tellPlayhead() {
@@ -356,6 +372,7 @@ function fillPage() {
   for (const [name, mask] of bandsOf(scene.sh_degree)) at("bands").append(new Option(name, mask));
   at("bands-row").hidden = !scene.sh_degree;
   at("truth-row").hidden = !scene.truth;
+  at("mode-layer").hidden = !scene.layers;
   grantWish();
   setPlaying(player.playing);
   setNear(0);
@@ -383,7 +400,9 @@ let scrubbing = false;
 function press(id, pressed) { at(id).setAttribute("aria-pressed", String(pressed)); }
 
 function setMode(mode) {
+  if (mode === "layer" && !scene.layers) return; // a folder for the web does not hold them
   look.mode = mode;
+  if (mode === "layer") askLayers();
   for (const name of MODES) press(`mode-${name}`, name === mode);
   dirty = true;
 }
@@ -575,6 +594,7 @@ const KEYS = {
   3: () => setMode("dynamic"),
   4: () => setMode("opacity"),
   5: () => setMode("map"),
+  6: () => setMode("layer"),
   b: () => { if (scene.sh_degree) cycleBands(); },
   i: () => at("stats").toggleAttribute("hidden"),
   m: () => setMeasuring(!ruler.on),

@@ -28,9 +28,11 @@ from hypothesis import strategies as st
 from packuv.camera import PinholeCamera
 from packuv.colour import lit
 from packuv.film import CameraPath
-from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
+from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
+from packuv.gaussians.uvmap import assign_slots
+from packuv.gaussians.uvsize import UvOptions
 from packuv.raster import RasterOptions, render
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.viewer import serve
@@ -42,6 +44,7 @@ from packuv.viewer.source import (
     describe,
     frame_bytes,
     key_bytes,
+    layer_bytes,
     near_plane,
     open_source,
     tables_bytes,
@@ -756,3 +759,43 @@ def test_the_page_writes_camera_paths_that_films_read(browser: Browser, tmp_path
         for name in ("width", "height", "fx", "fy", "cx", "cy"):
             assert getattr(view.camera, name) == pytest.approx(wanted[name])
         assert np.allclose(view.camera.camera_from_world, camera.camera_from_world, atol=1e-9)
+
+
+def test_layers_are_those_of_the_atlas() -> None:
+    source = make_source(count=3000)
+    with running(source) as server:
+        assert json.loads(fetch(server, "/scene.json")[1])["layers"] == UvOptions().layers
+        for number, part in enumerate(source.parts):
+            layers = np.frombuffer(fetch(server, f"/layers/{number}.bin")[1], np.uint8)
+            opacity = part.key.attributes[:, OPACITY]
+            shown = opacity > 0
+            points = source.quantizer.decode(part.key[shown]).means
+            slots = assign_slots(points, opacity[shown], source.quantizer.centre, options=UvOptions())
+            assert np.array_equal(layers[shown], slots.layer + 1)
+            assert not layers[~shown].any()
+        assert fetch(server, "/layers/3.bin")[0].status == 404
+
+
+@pytest.mark.slow
+def test_the_page_colours_by_layer(browser: Browser) -> None:
+    """One opaque Gaussian behind the other, seen from the centre: the first layer takes the more opaque one."""
+    source, camera = make_source(), make_ring()[0]
+    first = np.array([0.4, 0.1, 0.6])
+    centre = source.quantizer.centre
+    points = np.array([centre + first, centre + 0.8 * first + [0, 0, 1e-5]])
+    still, opacity = np.array([[1.0, 0, 0, 0]] * 2), np.array([OPACITY_RANGE[1], 1.0])
+    values = points, np.full((2, 3), -1.6), still, opacity, np.zeros((2, 1, 3))
+    codes = source.quantizer.encode(Gaussians(*(value.astype(np.float32) for value in values)))
+    part = Segment(0, codes, np.zeros(2, bool), np.empty((0, 0, 3), np.uint16), np.empty((0, 0, 10), np.uint8))
+    taken = np.frombuffer(layer_bytes(replace(source, parts=(part,)), 0), np.uint8)
+    with running(replace(source, parts=(part,), cameras=(camera,), near=0.1)) as server:
+        shown_at(browser, server, "play=0&frame=0&bare=1&mode=layer&background=0,0,0", camera.width, camera.height, 0)
+        browser.wait_for("document.documentElement.dataset.layers == 0")
+        time.sleep(0.5)
+        shown = browser.picture().astype(int)
+    far = np.argmax(codes.attributes[:, OPACITY])
+    pixel, _ = camera.project(source.quantizer.decode(codes).means[[far]])
+    x, y = pixel[0].astype(int)
+    assert sorted(taken) == [1, 2] or sorted(taken) == [1, 1]
+    assert shown[y, x].min() > 60  # light, for the first layer is there
+    assert shown[y, x, 0] > 0.8 * shown[y, x, 2]  # and not purple or blue
