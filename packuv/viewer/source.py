@@ -262,8 +262,8 @@ def key_bytes(source: Source, segment: int) -> bytes:
 
 
 def layer_bytes(source: Source, segment: int) -> bytes:
-    """Layer of the UV map, from 1 on, that takes each of the N rows of a keyframe, uint8; 0 where none does, or the row is
-    absent there. As in the atlas of `packuv atlas` with its default size."""
+    """Layer of the UV map, from 1 on, that takes each of the N rows of a keyframe, uint8; 0 where none does, or the row
+    is absent there. As in the atlas of `packuv atlas` with its default size."""
     if not 0 <= segment < len(source.segments):
         raise IndexError(f"segment {segment} of a scene with {len(source.segments)}")
     codes = source.key(segment)
