@@ -8,7 +8,7 @@ PYTEST ?=
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-fast check setup clean
+.PHONY: demo test test-fast check gpu setup clean
 
 demo: $(READY)
 	$(BIN)/packuv simulate runs/demo/capture --cameras 8 --frames 24 --size 320x180 --seed 7 --rig front
@@ -26,6 +26,10 @@ check: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# What a GPU does and how fast, within nine minutes; bench/gpu.sh runs by itself where nothing is set up.
+gpu: $(READY)
+	OUT=$${OUT:-runs/gpu} PYTHON=$(BIN)/python bench/gpu.sh
 
 setup: $(READY)
 

@@ -18,6 +18,7 @@ BENCHMARKS = (
     "doubts",
     "forecast",
     "front_end",
+    "gpu",
     "kills",
     "long",
     "masks",

@@ -107,8 +107,13 @@ def triangulate(
     """Points from pictures camera -> uint8 [H, W, 3] RGB, as filmed (distorted), one mapping per synchronized instant.
 
     An instant may lack cameras. Deterministic. Raises ValueError for pictures that do not fit the rig, for a rig
-    without a common volume, and when no point is found.
+    with fewer cameras than a point needs or without a common volume, and when no point is found.
     """
+    if len(rig.cameras) < options.min_views:
+        raise ValueError(
+            f"a point must be seen by {options.min_views} cameras (min_views), but there are {len(rig.cameras)}; in "
+            "pictures of two any features on one epipolar line would make a point, right or wrong"
+        )
     pairs = choose_pairs(rig, neighbours=options.neighbours)
     parts, evidence = [], []
     for pictures in instants:

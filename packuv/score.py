@@ -107,11 +107,12 @@ def score(
     silhouettes: Silhouettes | None = None,
     workers: int = 2,
     scratch: Path | None = None,
+    device: str = "cpu",
 ) -> list[Score]:
     """Score every frame on all cameras of the views, whose instant i is frame i of the scene.
 
     A camera without a picture at an instant is not scored there. `silhouettes` of some cameras have their foreground
-    scored, too. One thread draws, `workers` others compare; the scores
+    scored, too. One thread draws, on the `device`, cpu or cuda; `workers` others compare, and the scores
     do not depend on their number. What is scored goes to the folder `scratch`, from which the same scoring goes on
     after a kill; None: to one that goes away.
     """
@@ -120,7 +121,7 @@ def score(
         parts = [_Part(folder, range(len(scene))[first : first + PART]) for first in range(0, len(scene), PART)]
         stack.enter_context(one_opencv_thread())
         pool = stack.enter_context(ThreadPoolExecutor(workers))
-        scorer = _Scorer(scene, views, lpips, silhouettes, pool, AHEAD * workers)
+        scorer = _Scorer(scene, views, Artist(scene, device), lpips, silhouettes, pool, AHEAD * workers)
         for part in parts:
             if part.there:
                 scorer.pass_over(part.frames, part.scores(), progress)
@@ -137,17 +138,18 @@ class _Scorer:
         self,
         scene: Scene,
         views: Views,
+        artist: Artist,
         lpips: Measure | None,
         silhouettes: Silhouettes | None,
         pool: ThreadPoolExecutor,
         most_waiting: int,
     ) -> None:
-        self._scene, self._views, self._pool, self._most_waiting = scene, views, pool, most_waiting
+        self._scene, self._views, self._artist = scene, views, artist
+        self._pool, self._most_waiting = pool, most_waiting
         held_out = scene.header.held_out
         self.judges = [
             _Judge(views, index, name in held_out, lpips, silhouettes) for index, name in enumerate(views.names)
         ]
-        self._artist = Artist(scene)
         self._gaussians, self._shown = scene.gaussians(0), 0  # what was read last
         self._at = 0
         self._total_db, self._count = 0.0, 0

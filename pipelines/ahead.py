@@ -11,25 +11,35 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from calibration.importers import holds_lenses_alone
 from packuv.lpips import lacking
 from packuv.motion import MotionBackend
 from packuv.progress import Progress, no_progress
 from pipelines.choice import affordable, check_judges
 from pipelines.disk import free_bytes
 from pipelines.events import Event, Journal
-from pipelines.forecast import Forecast, Size, forecast, machine_of, question_of
+from pipelines.forecast import (
+    Forecast,
+    Machine,
+    Size,
+    forecast,
+    instants_more_seconds,
+    is_solved,
+    machine_of,
+    minutes_text,
+    question_of,
+)
 from pipelines.options import SequenceOptions
 from pipelines.process import There, find_sequence, jobs_at_once, jobs_of, options_of, plan_of, points_of, walk
 from pipelines.request import STAGES, RunRequest
 from pipelines.space import check_room, missing_bytes, size_found
 from pipelines.stages import Made
 from pipelines.stages import Sequence as Stages
-from sync.capture import Capture
+from sync.capture import Capture, find_masks
 from tasks.artefacts.digests import Signature
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
+from tasks.stages.calibrate import check_given
 from tasks.stages.plan import Plan
 
 LAST_OF = {
@@ -113,8 +123,8 @@ def look_ahead(request: RunRequest, *, progress: Progress = no_progress) -> Ahea
         point,
         size,
         tuple(_steps(expected, made, Store(root))),
-        tuple(dict.fromkeys([*_spared(capture, plan, options), *_skips(journal.events)])),
-        tuple(_unknown(capture, options, request.target_psnr is not None)),
+        tuple(dict.fromkeys([*_spared(capture, plan, options, size), *_skips(journal.events)])),
+        tuple(_unknown(capture, options, size, machine, request.target_psnr is not None)),
         expected,
         machine.probe.moving,
         root,
@@ -147,15 +157,23 @@ class _Unread(Originals):
 def _size(request: RunRequest, capture: Capture, plan: Plan, root: Path, progress: Progress) -> Size:
     """How much there is to process, of frames that are matched as the run would match them, unless it did already."""
     matching = replace(request, stop_after="sync", max_minutes=None, target_psnr=None)
-    made = walk(matching, (), Journal())[0].get("sync") if root.is_dir() else None
-    if made is not None:
-        return size_found(Store(root).path(made), plan)
+    made = walk(matching, (), Journal())[0] if root.is_dir() else Made()
+    if (groups := made.get("sync")) and (made.get("mask_files") or not find_masks(capture)):
+        return _sized(Store(root).path(groups), request, capture, plan)
     jobs, options = jobs_of(request), options_of(request, capture, request.preset)
     with TemporaryDirectory(prefix="packuv-plan-") as folder:
         originals = _Unread(capture, Path(folder) / "file_digests.json")
         workshop = Workshop(Store(Path(folder) / "store"), originals, jobs, _Passing(progress))
         stages = Stages(workshop, plan, options, lambda stage: There(workshop.make(stage)), Made())
-        return size_found(workshop.path(stages.matched()), plan)
+        return _sized(workshop.path(stages.matched()), request, capture, plan)
+
+
+def _sized(groups: Path, request: RunRequest, capture: Capture, plan: Plan) -> Size:
+    """Raises what a run would of this calibration and these videos."""
+    size = size_found(groups, plan)
+    if request.stop_after != "sync" and not capture.settings.rig_from:
+        check_given(capture.calibration, groups, tuple(plan.videos), plan.first)
+    return replace(size, solved=is_solved(capture))
 
 
 def _steps(expected: Forecast, made: Made, store: Store) -> Iterator[Step]:
@@ -176,11 +194,14 @@ def _fitted_frames(made: Made, store: Store) -> int:
     return sum(stop - start for start, stop in spans)
 
 
-def _spared(capture: Capture, plan: Plan, options: SequenceOptions) -> Iterator[tuple[str, str]]:
+def _spared(capture: Capture, plan: Plan, options: SequenceOptions, size: Size) -> Iterator[tuple[str, str]]:
     """Work that the capture or the settings spare."""
     fit = options.fit
-    if capture.calibration is not None and not _to_be_solved(capture):
-        yield "solving the cameras", f"they are imported from {capture.calibration.name}/, if the pictures confirm them"
+    if capture.settings.rig_from:
+        yield "solving the cameras", f"their rig is that of {capture.settings.rig_from}"
+    elif capture.calibration is not None and not size.solved:
+        given = capture.calibration.name + "/" * capture.calibration.is_dir()
+        yield "solving the cameras", f"they are imported from {given}, if the pictures confirm them"
     if not options.light.enabled:
         yield "light", "light.enabled is false"
     if not fit.background.instants:
@@ -204,15 +225,14 @@ def _skips(events: Sequence[Event]) -> Iterator[tuple[str, str]]:
     yield from ((event.label, event.reason) for event in events if event.outcome == "skipped")
 
 
-def _to_be_solved(capture: Capture) -> bool:
-    """Whether nothing says where the cameras stand."""
-    return capture.calibration is None or holds_lenses_alone(capture.calibration)
-
-
-def _unknown(capture: Capture, options: SequenceOptions, pilots: bool) -> Iterator[str]:
-    if _to_be_solved(capture):
-        known = "" if capture.calibration is None else ", of which the lenses alone are known,"
-        yield f"the cameras{known} have to be solved, which takes minutes to hours more"
+def _unknown(capture: Capture, options: SequenceOptions, size: Size, machine: Machine, pilots: bool) -> Iterator[str]:
+    if size.solved:
+        known = ", of which the lenses alone are known," if capture.calibration else ""
+        more = minutes_text(instants_more_seconds(size, options, machine) / 60)
+        yield (
+            f"the cameras{known} have to be solved by COLMAP, which is counted as from one instant of pictures full of "
+            f"features; where that does not place all, it takes {more} more"
+        )
     if options.motion.backend is MotionBackend.RAFT:
         yield "optical flow by RAFT takes half a second to seconds a picture more without a GPU"
     if pilots:

@@ -73,6 +73,7 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, formatter_class=_Help, **settings)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # -1:3 and -1,2 are wrong values, but no options
 
     def parse_known_args(  # type: ignore[override]  # argparse declares an overload for each kind of namespace
         self, args: Sequence[str] | None = None, namespace: Any = None
@@ -575,6 +576,7 @@ def _evaluate(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="torchvision's AlexNet or VGG-16 weights, to measure LPIPS",
     )
+    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
     _json(command)
 
 

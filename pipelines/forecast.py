@@ -7,9 +7,10 @@ the pace that a probe finds on this machine; docs/pareto.md states the model and
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from calibration.importers import holds_lenses_alone
 from packuv.budget import USUAL_BYTES
 from packuv.fit.pace import FitSize
 from packuv.motion.step import fitted_size
@@ -18,7 +19,7 @@ from pipelines.disk import size_text
 from pipelines.options import SequenceOptions
 from pipelines.probe import CAMERAS, INSTANTS, REFERENCE, Look, Probe, look, remember, remembered, spread
 from pipelines.request import STAGES
-from sync.capture import Capture, probe_capture
+from sync.capture import Capture, find_lender, probe_capture
 from tasks.artefacts.jobs import Jobs
 from tasks.stages.evaluate import GLANCE_FRAMES
 from tasks.stages.footage import PictureOptions
@@ -41,6 +42,9 @@ SECONDS: Mapping[str, float] = {
     "jobs": 0.8,
     "sync": 2.6e-4,
     "rig and points": 1.7,
+    "features": 0.71,
+    "pairs": 0.26,
+    "placing": 0.5,
     "light": 0.0103,
     "flow": 0.0436,
     "background": 0.06,
@@ -57,7 +61,7 @@ STEPS: Mapping[str, float] = {"backdrop iterations": 1.38, "keyframe iterations"
 times as much in "basketball", 1.63 times in the demo"""
 STAGE_OF: Mapping[str, str] = {
     "sync": "sync",
-    "rig and points": "calibrate",
+    **dict.fromkeys(("rig and points", "features", "pairs", "placing"), "calibrate"),
     "light": "calibrate",
     "flow": "flow",
     **dict.fromkeys(("background", "shell", "keyframes", "frames", *STEPS), "fit"),
@@ -65,6 +69,12 @@ STAGE_OF: Mapping[str, str] = {
     "verify": "verify",
     "scores": "evaluate",
 }
+FEATURES = 0.02
+"""Of a pixel of a textured picture; plain walls have a quarter of that"""
+REFERENCE_FEATURES = 4096
+"""Of a picture, with which `SECONDS` of a pair were measured; it goes by their square"""
+ALL_PAIRS, PARTNERS = 40, 12
+"""Cameras up to which a solve matches all pairs, and with how many it matches each beyond that"""
 JOBS: Mapping[str, int] = {"sync": 1, "calibrate": 3, "flow": 3, "fit": 2, "encode": 1, "verify": 1, "evaluate": 1}
 """Processes that a stage starts, those of segments aside"""
 JOBS_PER_SEGMENT = 3
@@ -99,6 +109,8 @@ class Size:
     """Width and height of each fitted camera's pictures as filmed, pixels"""
     held_out: tuple[tuple[int, int], ...] = ()
     """Likewise, of those to score on"""
+    solved: bool = False
+    """Whether nothing says where the cameras stand"""
 
     def __post_init__(self) -> None:
         if self.frames < 1 or not self.fitted:
@@ -182,13 +194,9 @@ def minutes_text(minutes: float) -> str:
 
 def size_of(capture: Capture, plan: Plan) -> Size:
     """Of what a plan means to process; reads the videos' packets. Raises what `probe_video` raises."""
-    return size_told(
-        {
-            name: (video.width, video.height, video.frame_count)
-            for name, video in probe_capture(capture, listen=False).items()
-        },
-        plan,
-    )
+    videos = probe_capture(capture, listen=False)
+    told = {name: (video.width, video.height, video.frame_count) for name, video in videos.items()}
+    return replace(size_told(told, plan), solved=is_solved(capture))
 
 
 def size_told(videos: Mapping[str, tuple[int, int, int]], plan: Plan) -> Size:
@@ -199,6 +207,13 @@ def size_told(videos: Mapping[str, tuple[int, int, int]], plan: Plan) -> Size:
         raise ValueError(f"the capture has {longest} instants, so none from {plan.first} on")
     sides = {name: (width, height) for name, (width, height, _) in videos.items()}
     return Size(frames, tuple(sides[name] for name in plan.fitted), tuple(sides[name] for name in plan.held_out))
+
+
+def is_solved(capture: Capture) -> bool:
+    """Whether nothing says where the cameras stand, also of the take whose rig this one uses. Raises ValueError for a
+    calibration/ that holds none, and what `find_lender` raises."""
+    given = (find_lender(capture) or capture).calibration
+    return given is None or holds_lenses_alone(given)
 
 
 def fit_size(size: Size, options: SequenceOptions) -> FitSize:
@@ -253,6 +268,7 @@ def work_of(size: Size, options: SequenceOptions, probe: Probe) -> dict[str, flo
     return {
         "sync": frames * (len(size.fitted) + len(size.held_out)),
         "rig and points": filmed,
+        **_solving(size, options),
         "light": frames * filmed * options.light.enabled,
         "flow": frames * fitted * picture,
         "background": fit.background.instants * fitted,
@@ -266,6 +282,26 @@ def work_of(size: Size, options: SequenceOptions, probe: Probe) -> dict[str, flo
         "verify": frames * gaussians,
         "scores": frames * scored + min(frames, GLANCE_FRAMES) * beside,
     }
+
+
+def _solving(size: Size, options: SequenceOptions) -> dict[str, float]:
+    """Of a solve from one instant: Mpx, pairs of pictures with `REFERENCE_FEATURES` each, and cameras to place."""
+    sides, most = size.fitted + size.held_out, options.rig.solve.features.max_features
+    pixels, count = sum(width * height for width, height in sides) * size.solved, len(sides) * size.solved
+    features = min(most, FEATURES * pixels / max(1, count))
+    pairs = count * (count - 1) / 2 if count <= ALL_PAIRS else count * PARTNERS
+    return {
+        "features": pixels / 1e6,
+        "pairs": pairs * (features / REFERENCE_FEATURES) ** 2,
+        "placing": count,
+    }
+
+
+def instants_more_seconds(size: Size, options: SequenceOptions, machine: Machine) -> float:
+    """What a solve takes on top where one instant does not place all cameras and it looks at more."""
+    work = _solving(size, options)
+    once = sum(SECONDS[kind] * work[kind] for kind in ("features", "pairs"))
+    return machine.pace * (once * options.rig.more_instants + SECONDS["placing"] * work["placing"])
 
 
 def forecast(size: Size, options: SequenceOptions, machine: Machine, stop_after: str = STAGES[-1]) -> Forecast:
@@ -286,7 +322,7 @@ def forecast(size: Size, options: SequenceOptions, machine: Machine, stop_after:
 
 def pilot_minutes(size: Size, options: SequenceOptions, machine: Machine, frames: int) -> float:
     """Minutes of a pilot of so many frames: all before the fits, the backdrop, a keyframe and its frames, scored."""
-    first = Size(frames, size.fitted, size.held_out)
+    first = replace(size, frames=frames)
     whole, short = (_costs(one, options, machine) for one in (size, first))
     few = (*PER_SEGMENT, "encode", "scores")
     starting = sum(_starting(stage, first, machine) for stage in JOBS if stage != "verify")

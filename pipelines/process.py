@@ -22,7 +22,17 @@ from pipelines.choice import PILOT_FRAMES, Affordable, Priced, affordable, check
 from pipelines.crew import CORES_PER_JOB, crew_of
 from pipelines.events import Event, Journal
 from pipelines.folder import claim
-from pipelines.forecast import Forecast, Guess, Machine, forecast, machine_of, question_of, size_of, size_told
+from pipelines.forecast import (
+    Forecast,
+    Guess,
+    Machine,
+    forecast,
+    is_solved,
+    machine_of,
+    question_of,
+    size_of,
+    size_told,
+)
 from pipelines.ladder import up_to
 from pipelines.lender import lender_of
 from pipelines.options import SequenceOptions, check_raft, compose
@@ -200,6 +210,7 @@ def foresee(run: Run, journal: Journal, expected: list[Forecast], groups: Key) -
     videos = read_videos(run.workshop.path(groups))
     told = {name: (video["width"], video["height"], video["frames"]) for name, video in videos.items()}
     size, at_once = size_told(told, run.plan), jobs_at_once(run.request)
+    size = replace(size, solved=is_solved(run.workshop.capture))
     question = question_of(run.plan, size, (run.options,))
     rough = forecast(size, run.options, Machine(Guess(), at_once), run.request.stop_after)
     if rough.minutes < WORTH_MINUTES and remembered(folder, question, jobs) is None:

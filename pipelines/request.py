@@ -122,7 +122,7 @@ def parse_range(text: str) -> tuple[int, int | None]:
     match = re.fullmatch(r"(\d{0,15}):(\d{0,15})", text)
     first, stop = (int(part) if part else None for part in match.groups()) if match else (None, None)
     if not match or (stop is not None and stop <= (first or 0)):
-        raise ValueError(f"must be A:B with A < B, as 0:30 for the first thirty, but is {text!r}")
+        raise ValueError(f"must be A:B with 0 <= A < B, as 0:30 for the first thirty, but is {text!r}")
     return first or 0, stop
 
 

@@ -8,6 +8,7 @@ would keep that worker from working.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from pipelines.request import STAGES
 from pipelines.space import check_space
 from sync.capture import find_capture, find_masks, find_plate
 from sync.clock import ClockMode
+from tasks.artefacts.jobs import CancelledError
 from tasks.artefacts.stage import Files, Stage
 from tasks.artefacts.store import Key
 from tasks.artefacts.workshop import Workshop
@@ -159,16 +161,20 @@ class Sequence:
 
     def matched(self) -> Key:
         """Which frames belong together; raises ValueError or FileNotFoundError for what a run refuses until then."""
-        capture = find_capture(self.plan.capture)
-        find_plate(capture)  # whose absence should not show hours later
-        masks = find_masks(capture)
+        find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
+        self._match_masks()
         options, starts = self.options, None
         if options.sync.clock is ClockMode.CONTENT:
             starts = self._make(find_starts(self.workshop, options.motion, options.pictures.transfer))
-        groups = self._make(synchronize(self.workshop, options.sync, starts))
-        if masks:
-            self._make(MatchMasks(groups=groups, masks=self.workshop.files(masks, "reading masks")))
-        return groups
+        return self._make(synchronize(self.workshop, options.sync, starts))
+
+    def _match_masks(self) -> None:
+        capture, workshop = self.workshop.capture, self.workshop
+        if masks := find_masks(capture):
+            videos = workshop.files({camera: capture.videos[camera] for camera in masks}, "reading videos")
+            # Nothing is made of it: who only looks goes on, and a cancelled run ends where it works next.
+            with suppress(CancelledError):
+                self._make(MatchMasks(videos=videos, masks=workshop.files(masks, "reading masks")))
 
     def _synchronize(self) -> None:
         groups = self.matched()
@@ -361,8 +367,8 @@ class Sequence:
         scene, named = self.made.only("encode"), self.options.evaluate.lpips_weights
         beside = cameras_beside(self.placed, self.options.evaluate)
         weights = Path(named).resolve() if named else None
-        why = lacking(weights)
+        why, device = lacking(weights), self.options.fit.device
         if why or weights is None:
-            return Evaluate(take=take, beside=beside, scene=scene, no_lpips=why)
+            return Evaluate(take=take, beside=beside, scene=scene, no_lpips=why, device=device)
         backbone = self.workshop.files({"backbone": weights}, "evaluate")
-        return Evaluate(take=take, beside=beside, scene=scene, backbone=backbone, weights=str(weights))
+        return Evaluate(take=take, beside=beside, scene=scene, backbone=backbone, weights=str(weights), device=device)

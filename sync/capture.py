@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 import unicodedata
 from collections import Counter
@@ -20,7 +21,7 @@ from sync.chapters import unjoined
 from sync.clock import ClockMode
 from sync.natural import natural_key
 from sync.offsets import MOST_OFFSET_S, find_offsets, offset_notes, read_offsets
-from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
+from sync.pictures import PICTURE_SUFFIXES, Pictures, holds_pictures, is_picture, list_pictures
 from sync.probe import VideoInfo, container_timecodes, probe_video
 from sync.timecode import NANOSECONDS, SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
 
@@ -43,8 +44,6 @@ SHARED_TIMECODES, SHARED_SUFFIXES = "timestamps.csv", (".csv", ".tsv")
 SETTINGS = "capture.toml"
 MASKS = "masks"
 """Folder of foreground masks"""
-SHAPES_APART = 0.01
-"""By which the ratio of a mask's sides may differ from its camera's: sides are whole pixels"""
 SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
 TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10", "linear")
@@ -231,17 +230,22 @@ def find_masks(capture: Capture) -> dict[str, Path]:
 
     Raises ValueError where masks/ holds none, or some of what is no camera.
     """
-    inside = capture.folder / MASKS
-    if not inside.is_dir():
+    inside, wanted = capture.folder / MASKS, "<camera>/000000.png or <camera>.mp4"
+    if not os.path.lexists(inside):
         return {}
+    if not inside.is_dir():
+        raise ValueError(f"{inside} must be a folder that holds masks as {wanted}, but is none; rename it")
+    if loose := sorted((path.name for path in inside.iterdir() if is_picture(path.name)), key=natural_key):
+        raise ValueError(
+            f"{inside} must hold masks as {wanted}, but pictures lie in no camera's folder: {len(loose)}, the first of "
+            f"them {loose[0]}; move those of each camera into a folder with its name"
+        )
     found, ignored = _by_camera(inside, _cameras(inside)), capture.settings.ignore
     folders = [path for path in inside.iterdir() if path.is_dir() and not path.name.startswith(".")]
     if empty := sorted(path for path in folders if not holds_pictures(path)):
         raise ValueError(f"{empty[0]} must hold numbered masks, as 000000.png, but holds none; add them or take it out")
     if not found:
-        raise ValueError(
-            f"{inside} must hold masks as <camera>/000000.png or <camera>.mp4, but holds none; take it out"
-        )
+        raise ValueError(f"{inside} must hold masks as {wanted}, but holds none; take it out")
     if unknown := [camera for camera in found if camera not in capture.videos and camera not in ignored]:
         raise ValueError(
             f"{found[unknown[0]]} belongs to no video{_suggest(unknown[0], capture.videos)}; name it like its video"
@@ -249,34 +253,31 @@ def find_masks(capture: Capture) -> dict[str, Path]:
     return {camera: found[camera] for camera in capture.cameras if camera in found}
 
 
-def check_masks(capture: Capture, videos: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raise ValueError unless each camera with masks has as many as its video has frames, with the same numbers, and
-    the first of them has the shape of its pictures; `videos` says frames, width and height of each camera."""
-    for camera, path in find_masks(capture).items():
-        info, (frames, width, height) = (
-            probe_video(path),
-            (videos[camera][key] for key in ("frames", "width", "height")),
+def check_masks(capture: Capture, camera: str) -> tuple[int, int]:
+    """Width and height of the pictures of a camera with masks; raises ValueError unless it has as many masks as its
+    video has frames, with the same numbers."""
+    path, video = find_masks(capture)[camera], capture.videos[camera]
+    masks, info = list_pictures(path) if path.is_dir() else None, probe_video(video, listen=False)
+    if masks and masks.empty:
+        name = path / masks.empty[0]
+        raise ValueError(f"{name} is an empty file, but must hold a mask; copy it again, or make it anew")
+    count = len(masks) if masks else probe_video(path, listen=False).frame_count
+    if count != info.frame_count:
+        raise ValueError(
+            f"{path} must have a mask for each of the {info.frame_count} frames of {camera}, but has {count}"
+            f"{_without_number(masks)}; add those that are missing, or take it out"
         )
-        if info.frame_count != frames:
-            raise ValueError(
-                f"{path} must have a mask for each of the {frames} frames of {camera}, but has {info.frame_count}; add "
-                "those that are missing, or take it out"
-            )
-        if abs(info.width * height / (info.height * width) - 1) > SHAPES_APART:
-            raise ValueError(
-                f"{path} must have masks in the shape of the pictures of {camera}, {width}x{height}, but they are "
-                f"{info.width}x{info.height}; make them anew of these pictures, or take them out"
-            )
-        video = capture.videos[camera]
-        if not (path.is_dir() and video.is_dir()):
-            continue
-        own, wanted = list_pictures(path).numbers, list_pictures(video).numbers
-        if not np.array_equal(own, wanted):
-            odd = int(np.flatnonzero(own != wanted)[0])
-            raise ValueError(
-                f"{path} must have masks with the numbers of the pictures of {camera}, but frame {odd} is picture "
-                f"{wanted[odd]} and mask {own[odd]}; number them alike"
-            )
+    if masks and video.is_dir() and not np.array_equal(masks.numbers, wanted := list_pictures(video).numbers):
+        odd = int(np.flatnonzero(masks.numbers != wanted)[0])
+        raise ValueError(
+            f"{path} must have masks with the numbers of the pictures of {camera}, but frame {odd} is picture "
+            f"{wanted[odd]} and mask {masks.numbers[odd]}; number them alike"
+        )
+    return info.width, info.height
+
+
+def _without_number(masks: Pictures | None) -> str:
+    return f", and {masks.others[0]} without a number" if masks and masks.others else ""
 
 
 def probe_capture(

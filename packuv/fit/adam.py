@@ -94,12 +94,17 @@ def adam_step(
     rates = np.broadcast_to(np.asarray(rate, np.float32), (columns,))
     _step(parameters.reshape(count, columns), gradient.reshape(count, columns), state.first, state.second, state.steps,
           np.ascontiguousarray(rates), np.ascontiguousarray(chosen).view(np.uint8),
-          _corrections(options.beta1, options.beta2), *map(_f32, (options.beta1, 1 - options.beta1, options.beta2,
-          1 - options.beta2, options.epsilon)))  # fmt: skip
+          corrections(options.beta1, options.beta2), *factors(options))  # fmt: skip
+
+
+def factors(options: AdamOptions) -> tuple[np.float32, ...]:
+    """What a step keeps of the first moment and takes of the gradient, the same of the second, and epsilon."""
+    beta1, beta2 = options.beta1, options.beta2
+    return tuple(map(_f32, (beta1, 1 - beta1, beta2, 1 - beta2, options.epsilon)))
 
 
 @cache
-def _corrections(beta1: float, beta2: float) -> np.ndarray:
+def corrections(beta1: float, beta2: float) -> np.ndarray:
     """What moments that began at zero lack, by step: factors of the first and of the second's root, float32 [S, 2].
 
     The last row is 1 within rounding, and serves for all later steps.
@@ -111,19 +116,25 @@ def _corrections(beta1: float, beta2: float) -> np.ndarray:
     return np.stack(table, axis=1).astype(np.float32)
 
 
+@kernel(inline=True, fastmath=_FAST)
+def step_row(parameters, gradient, first, second, steps, rates, corrections, keep1, add1, keep2, add2, epsilon, i):
+    """One step of row i, on the CPU and on a GPU."""
+    steps[i] += 1
+    step = min(steps[i], corrections.shape[0] - 1)
+    for k in range(parameters.shape[1]):
+        g = gradient[i, k]
+        m = keep1 * first[i, k] + add1 * g
+        v = keep2 * second[i, k] + add2 * g * g
+        first[i, k], second[i, k] = m, v
+        root = math.sqrt(v) * corrections[step, 1] + epsilon
+        parameters[i, k] -= rates[k] * corrections[step, 0] * m / root
+
+
 @kernel(parallel=True, fastmath=_FAST)
 def _step(parameters, gradient, first, second, steps, rates, rows, corrections, keep1, add1, keep2, add2, epsilon):
-    count, columns = parameters.shape
+    count = parameters.shape[0]
     for chunk in prange(_CHUNKS):
         for i in range(count * chunk // _CHUNKS, count * (chunk + 1) // _CHUNKS):
-            if rows[i] == 0:
-                continue
-            steps[i] += 1
-            step = min(steps[i], corrections.shape[0] - 1)
-            for k in range(columns):
-                g = gradient[i, k]
-                m = keep1 * first[i, k] + add1 * g
-                v = keep2 * second[i, k] + add2 * g * g
-                first[i, k], second[i, k] = m, v
-                root = math.sqrt(v) * corrections[step, 1] + epsilon
-                parameters[i, k] -= rates[k] * corrections[step, 0] * m / root
+            if rows[i] != 0:
+                step_row(parameters, gradient, first, second, steps, rates, corrections, keep1, add1, keep2, add2,
+                         epsilon, i)  # fmt: skip

@@ -54,6 +54,11 @@ def obstacle() -> str | None:
         return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[-1]}"
 
 
+def gpu_is_full(error: BaseException) -> bool:
+    """Whether an error says that the GPU's memory is used up: torch's, or the driver's by way of numba."""
+    return type(error).__name__ == "OutOfMemoryError" or "CUDA_ERROR_OUT_OF_MEMORY" in str(error)
+
+
 def drawn_differently(device: str) -> str | None:
     """In what a device's pictures or gradients of a made-up scene differ from the CPU's; None where they agree."""
     gaussians, camera = _scene(), _camera()

@@ -19,7 +19,7 @@ from packuv.fit.lift import lift_motion
 from packuv.fit.model import Model
 from packuv.fit.options import FrameOptions
 from packuv.fit.shots import find_shots, moving_rows
-from packuv.fit.solver import Solver, tiled
+from packuv.fit.solver import open_solver, tiled
 from packuv.fit.start.first import empty_gaussians
 from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY, Codes
@@ -82,7 +82,7 @@ def _fit_frame(
     if not any(mask is not None and mask.any() for mask in masks):
         return rows, {"instant": instant, "seconds": time.monotonic() - started, "iterations": 0, "dynamic": 0}
     rng = np.random.default_rng([options.seed, instant, 2])
-    solver = Solver(model, key.bounds, options, rng, backdrop)
+    solver = open_solver(model, key.bounds, options, rng, backdrop)
     solver.fix(key.quantizer)
     rows = moving_rows(model.gaussians, key.quantizer, views, masks, key.bounds, options)
     model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, optical_flows, masks,

@@ -26,7 +26,8 @@ GRADIENT_LIMIT = 1e18
 """A larger gradient's square leaves the range of float32, and the optimizer's second moment would stay infinite"""
 
 _CHUNKS = 64
-_LIMITS = np.array([LIMITS[name] for name in ATTRIBUTES], np.float32)
+VALUE_LIMITS = np.array([LIMITS[name] for name in ATTRIBUTES], np.float32)
+"""In the order of `ATTRIBUTES`"""
 _log = logging.getLogger(__name__)
 
 
@@ -75,7 +76,8 @@ class Guard:
         faults = np.zeros(count, np.int8)
         prefer_tbb()
         _inspect(*flat.values(), *(slopes[name] for name in ATTRIBUTES), *good, gradients is not None,
-                 np.ascontiguousarray(rows).view(np.uint8), _LIMITS, np.float32(GRADIENT_LIMIT), faults)  # fmt: skip
+                 np.ascontiguousarray(rows).view(np.uint8), VALUE_LIMITS, np.float32(GRADIENT_LIMIT),
+                 faults)  # fmt: skip
         return faults
 
     def _report(
@@ -120,6 +122,53 @@ def _copy(source, target, i, columns):
         target[i, k] = source[i, k]
 
 
+# Widths are literals, so that the loops unroll: half the time. From the last to the first, so that the first attribute
+# at fault is named. The GPU's guard is made of the same functions.
+
+
+@kernel(inline=True)
+def fault_of_values(means, log_scales, quaternions, logits, sh, limits, i):
+    """0 for a row in order, else 1 + the place of the attribute."""
+    fault = 0
+    if not _within(sh, i, sh.shape[1], limits[4]):
+        fault = 5
+    if not _within(logits, i, 1, limits[3]):
+        fault = 4
+    if not _within(quaternions, i, 4, limits[2]):
+        fault = 3
+    if not _within(log_scales, i, 3, limits[1]):
+        fault = 2
+    if not _within(means, i, 3, limits[0]):
+        fault = 1
+    return fault
+
+
+@kernel(inline=True)
+def fault_of_gradients(d_means, d_log_scales, d_quaternions, d_logits, d_sh, limit, i):
+    """0 for a row in order, else 6 + the place of the attribute."""
+    fault = 0
+    if not _within(d_sh, i, d_sh.shape[1], limit):
+        fault = 10
+    if not _within(d_logits, i, 1, limit):
+        fault = 9
+    if not _within(d_quaternions, i, 4, limit):
+        fault = 8
+    if not _within(d_log_scales, i, 3, limit):
+        fault = 7
+    if not _within(d_means, i, 3, limit):
+        fault = 6
+    return fault
+
+
+@kernel(inline=True)
+def copy_row(means, log_scales, quaternions, logits, sh, to_means, to_log_scales, to_quaternions, to_logits, to_sh, i):
+    _copy(means, to_means, i, 3)
+    _copy(log_scales, to_log_scales, i, 3)
+    _copy(quaternions, to_quaternions, i, 4)
+    _copy(logits, to_logits, i, 1)
+    _copy(sh, to_sh, i, sh.shape[1])
+
+
 @kernel(parallel=True)
 def _inspect(means, log_scales, quaternions, logits, sh, d_means, d_log_scales, d_quaternions, d_logits, d_sh,
              good_means, good_log_scales, good_quaternions, good_logits, good_sh, with_gradients, rows, limits,
@@ -130,34 +179,12 @@ def _inspect(means, log_scales, quaternions, logits, sh, d_means, d_log_scales, 
         for i in range(count * chunk // _CHUNKS, count * (chunk + 1) // _CHUNKS):
             if rows[i] == 0:
                 continue
-            fault = 0
-            # Widths are literals, so that the loops unroll: half the time.
-            # From the last to the first, so that the first attribute at fault is named, and a gradient before all.
-            if not _within(sh, i, sh.shape[1], limits[4]):
-                fault = 5
-            if not _within(logits, i, 1, limits[3]):
-                fault = 4
-            if not _within(quaternions, i, 4, limits[2]):
-                fault = 3
-            if not _within(log_scales, i, 3, limits[1]):
-                fault = 2
-            if not _within(means, i, 3, limits[0]):
-                fault = 1
+            fault = fault_of_values(means, log_scales, quaternions, logits, sh, limits, i)
             if with_gradients:
-                if not _within(d_sh, i, sh.shape[1], gradient_limit):
-                    fault = 10
-                if not _within(d_logits, i, 1, gradient_limit):
-                    fault = 9
-                if not _within(d_quaternions, i, 4, gradient_limit):
-                    fault = 8
-                if not _within(d_log_scales, i, 3, gradient_limit):
-                    fault = 7
-                if not _within(d_means, i, 3, gradient_limit):
-                    fault = 6
+                by_gradient = fault_of_gradients(d_means, d_log_scales, d_quaternions, d_logits, d_sh, gradient_limit,
+                                                 i)  # fmt: skip
+                fault = by_gradient if by_gradient != 0 else fault
             faults[i] = fault
             if fault == 0:
-                _copy(means, good_means, i, 3)
-                _copy(log_scales, good_log_scales, i, 3)
-                _copy(quaternions, good_quaternions, i, 4)
-                _copy(logits, good_logits, i, 1)
-                _copy(sh, good_sh, i, sh.shape[1])
+                copy_row(means, log_scales, quaternions, logits, sh,
+                         good_means, good_log_scales, good_quaternions, good_logits, good_sh, i)  # fmt: skip

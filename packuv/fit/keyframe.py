@@ -31,7 +31,7 @@ from packuv.fit.bands import Judgement, judge, left_out, still_bands
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
 from packuv.fit.shots import Shot, find_shots, halved, moving_rows
-from packuv.fit.solver import Losses, Solver, tiled
+from packuv.fit.solver import Losses, Solver, open_solver, tiled
 from packuv.fit.start.bounds import Bounds, find_bounds
 from packuv.fit.start.first import AIR_OPACITY, first_gaussians, neighbour_distance, round_gaussians
 from packuv.fit.start.hull import hull_points, in_hull
@@ -161,7 +161,7 @@ def _fit_all(
     start = first_gaussians(cameras, targets, bounds=bounds, surface=_surface(shell, points, options),
                             options=options.start, sh_degree=0, seed=options.seed)  # fmt: skip
     model = Model(start)
-    solver = Solver(model, bounds, options, rng)
+    solver = open_solver(model, bounds, options, rng)
     total, grow_from = options.iterations, len(model)
     ticks = Ticks(progress, total)
     judges = left_out(cameras) if options.sh_degree else []
@@ -217,7 +217,7 @@ def fit_next(
         options = replace(options, rates=options.rates.faster(options.key_rate_scale))
     rng = np.random.default_rng([options.seed, instant, 1])
     model = Model(previous.foreground)
-    solver = Solver(model, bounds, options, rng, previous.open_backdrop(options.device, views.budget))
+    solver = open_solver(model, bounds, options, rng, previous.open_backdrop(options.device, views.budget))
     solver.fix(quantizer)
     standing = unlike_background(views, instant, stills, motion)
     ahead = _ahead(views, instant, standing, silhouettes)

@@ -72,7 +72,7 @@ def photometric_loss(
             f"tiles must be bool {shape} for pictures {picture.shape}, but is {active.dtype} {active.shape}"
         )
     gradient = np.empty_like(target) if out is None else out
-    pixels = _pixel_count(active, height, width)
+    pixels = pixel_count(active, height, width)
     scale = 1.0 / max(channels * pixels, 1)
     scales = (1 - options.ssim_share) * scale, -options.ssim_share * scale
     if tiles is not None:
@@ -113,7 +113,7 @@ def _checked(picture: np.ndarray, target: np.ndarray) -> tuple[int, int, int]:
     return picture.shape
 
 
-def _pixel_count(active: np.ndarray, height: int, width: int) -> int:
+def pixel_count(active: np.ndarray, height: int, width: int) -> int:
     """Pixels of the picture inside active tiles."""
     rows = np.minimum(TILE, height - TILE * np.arange(active.shape[0]))
     columns = np.minimum(TILE, width - TILE * np.arange(active.shape[1]))

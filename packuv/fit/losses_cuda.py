@@ -12,6 +12,7 @@ import numba.cuda
 import numpy as np
 import torch
 from numba import float32
+from torch import Tensor
 
 from packuv.fit.losses import C1, C2, RADIUS, WINDOW
 from packuv.raster.cuda.launch import MEMORY, THREADS, on_device, run
@@ -27,20 +28,28 @@ _TAPS = 2 * RADIUS + 1
 def compare_on_gpu(
     picture: np.ndarray, target: np.ndarray, active: np.ndarray, l1_scale: float, ssim_scale: float
 ) -> tuple[float, float, np.ndarray]:
-    """Sums of absolute differences and of SSIM over active pixels, and the gradient [C, H, W]; see `losses`.
+    """Sums of absolute differences and of SSIM over active pixels, and the gradient [C, H, W]; see `losses`."""
+    where = on_device(active.view(np.uint8)), on_device(np.flatnonzero(active))
+    sums, gradient = compare(on_device(picture), on_device(target), *where, l1_scale, ssim_scale)
+    absolute, similarity = sums.tolist()
+    return absolute, similarity, gradient.cpu().numpy()
 
-    The gradient is that of `l1_scale` times the first and `ssim_scale` times the second sum.
+
+def compare(
+    picture: Tensor, target: Tensor, active: Tensor, tiles: Tensor, l1_scale: float, ssim_scale: float
+) -> tuple[Tensor, Tensor]:
+    """The same of tensors that stay on the GPU: both sums, float64 [2], and the gradient.
+
+    `tiles` numbers the `active` ones, uint8. The gradient is that of `l1_scale` times the first and `ssim_scale` times
+    the second sum.
     """
-    tiles = on_device(np.flatnonzero(active))
-    blocks = len(picture) * len(tiles)
-    pictures = on_device(picture), on_device(target), on_device(active.view(np.uint8)), tiles
+    blocks, pictures = len(picture) * len(tiles), (picture, target, active, tiles)
     derivatives = torch.zeros((3, *picture.shape), device=MEMORY)
     gradient, sums = torch.zeros(picture.shape, device=MEMORY), torch.zeros((blocks, 2), device=MEMORY)
     window = on_device(WINDOW)
     run(_compare, blocks, *pictures, window, derivatives, sums)
     run(_slopes, blocks, *pictures, window, derivatives, _f32(l1_scale), _f32(ssim_scale), gradient)
-    absolute, similarity = sums.double().sum(0).tolist()
-    return absolute, similarity, gradient.cpu().numpy()
+    return sums.double().sum(0), gradient
 
 
 @cuda.jit(device=True)

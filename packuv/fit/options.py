@@ -52,8 +52,10 @@ class SolverOptions(LossOptions):
     """Draw backdrop and keyframes before a colour at random in each iteration, but where a picture is black: what it
     shows must then be covered, and no camera can be explained by leaving a place half transparent"""
     seed: int = 0
-    device: str = "cpu"
-    """Who renders, compares and labels: "cpu", or "cuda" (see `packuv.fit.device`); the CPU does the rest either way"""
+    device: str = field(default="cpu", metadata={"in every recipe": "cpu"})
+    """Who renders, compares, steps and labels: "cpu", or "cuda", where iterations stay from the first to the last (see
+    `packuv.fit.device` and `packuv.fit.resident`). No artefact is named after it: a fit goes on where another device
+    ended"""
     density: DensityOptions = field(default_factory=DensityOptions)
     rates: Rates = field(default_factory=Rates)
     uv: UvOptions = field(default_factory=UvOptions)

@@ -11,7 +11,7 @@ from packuv.camera import PinholeCamera
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions
 from packuv.fit.shots import Shot
-from packuv.fit.solver import Solver
+from packuv.fit.solver import Solver, open_solver
 from packuv.fit.start.bounds import Bounds
 from packuv.gaussians.floats import Gaussians
 
@@ -36,7 +36,7 @@ class FitSize:
 
 def step_seconds(size: FitSize) -> float:
     """Of one iteration of a fit on whole pictures, median."""
-    solver, shots = _made_up(size)
+    solver, shots = made_up(size)
     solver.run(shots, WARM, of=1000)
     found = list[float]()
     for _ in range(ROUNDS):
@@ -46,7 +46,7 @@ def step_seconds(size: FitSize) -> float:
     return float(np.median(found))
 
 
-def _made_up(size: FitSize) -> tuple[Solver, list[Shot]]:
+def made_up(size: FitSize, device: str = "cpu") -> tuple[Solver, list[Shot]]:
     """A ball of Gaussians that hides all behind it, filmed from within, with as many layers as a fit has."""
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(size.gaussians, 3))
@@ -60,7 +60,7 @@ def _made_up(size: FitSize) -> tuple[Solver, list[Shot]]:
     target = rng.random((3, size.height, size.width)).astype(np.float32)
     shots = [Shot(_camera(size, angle), target) for angle in (0.0, 1.5, 3.0, 4.5)]
     bounds = Bounds(np.zeros(3), 1.0, 0.2)
-    return Solver(Model(gaussians), bounds, FirstOptions(), rng), shots
+    return open_solver(Model(gaussians), bounds, FirstOptions(device=device), rng), shots
 
 
 def _camera(size: FitSize, angle: float) -> PinholeCamera:

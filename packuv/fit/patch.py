@@ -15,7 +15,7 @@ from packuv.fit.backdrop import Backdrop, joined
 from packuv.fit.keyframe import DEAD_CODE, KeyState, born_in_hull, figures_of, inside, still_shot, undone
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, NextOptions
-from packuv.fit.solver import Solver, tiled
+from packuv.fit.solver import open_solver, tiled
 from packuv.fit.start.bounds import find_bounds
 from packuv.fit.start.first import StartOptions
 from packuv.fit.start.hull import hull_points
@@ -82,7 +82,7 @@ def fit_patch(
     fresh = max(0, min(spare, round(DENSITY * share * len(previous.gaussians))))
     density = replace(options.density, cap=len(previous.gaussians) + fresh)
     still = Backdrop(quantizer.decode(quantizer.encode(kept)), bounds.near, options.device, views.budget)
-    solver = Solver(
+    solver = open_solver(
         Model(rows_of(previous.gaussians, loose)), bounds, replace(options, density=density), rng, backdrop=still
     )
     solver.fix(quantizer)

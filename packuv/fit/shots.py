@@ -19,6 +19,9 @@ from packuv.footage.response import PLAIN
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import Gaussians
 
+VOID = 16 / 255
+"""A pixel whose channels are all at most so bright may show nothing: decoded black is not quite black"""
+
 Later = Callable[[], np.ndarray]
 """Reads an array when it is needed: of many cameras one at a time is whole in memory"""
 
@@ -48,6 +51,11 @@ class Shot:
     def certain(self) -> np.ndarray | None:
         """What is `known`, bool [H, W]."""
         return self.known() if callable(self.known) else self.known
+
+    @property
+    def void(self) -> np.ndarray:
+        """Where the picture may show nothing, bool [H, W]."""
+        return np.asarray(self.target.max(axis=0) <= VOID)
 
     def opened(self) -> Shot:
         """The same with its arrays in memory."""

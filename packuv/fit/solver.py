@@ -1,4 +1,8 @@
-"""Iterations over the pictures of one instant: render, compare, step, and keep the number of Gaussians in hand."""
+"""Iterations over the pictures of one instant: render, compare, step, and keep the number of Gaussians in hand.
+
+`Solver` holds the schedule and all choices at random, and iterates on the CPU; `packuv.fit.resident` iterates on a GPU
+by the same schedule. `open_solver` gives the one that the options' device asks for.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +28,6 @@ from packuv.gaussians.floats import ALPHA_MIN, ATTRIBUTES, Gaussians, opacity, r
 from packuv.progress import Ticks
 from packuv.raster import Arena, Gradients, RasterOptions, Rendering, gradients, render
 
-_VOID = 16 / 255
-"""A pixel whose channels are all below may show nothing: decoded black is not quite black"""
-
 _BARE = 0.25
 """Share of all pixels that may show nothing from which on they do: the stage is black, or was masked"""
 
@@ -50,13 +51,23 @@ def mean_losses(losses: Sequence[Losses]) -> Losses:
     return {name: float(np.mean([part[name] for part in losses if name in part])) for name in names}
 
 
-def _void(target: np.ndarray) -> np.ndarray:
-    """Where a picture, float32 [3, H, W], may show nothing, bool [H, W]."""
-    return np.asarray(target.max(axis=0) <= _VOID)
+def open_solver(
+    model: Model,
+    bounds: Bounds,
+    options: SolverOptions,
+    rng: np.random.Generator,
+    backdrop: Backdrop | None = None,
+) -> Solver:
+    """A solver on the options' device, with the arguments of `Solver`."""
+    if options.device == "cpu":
+        return Solver(model, bounds, options, rng, backdrop)
+    from packuv.fit.resident import ResidentSolver  # late, for it needs torch
+
+    return ResidentSolver(model, bounds, options, rng, backdrop)
 
 
 class Solver:
-    """Iterations over the pictures of one instant."""
+    """Iterations over the pictures of one instant, on the CPU."""
 
     def __init__(
         self,
@@ -179,9 +190,11 @@ class Solver:
             index, opaque = self._next(shots), self._options.random_background
             losses.append(self._iterate(shots, index, self._near(), progress=self.done / of, opaque=opaque))
             if grow_from is not None and self.done % density.every == 0 and self.done < of * density.until:
+                self._come_home()
                 self._change_density(of, grow_from)
             if ticks:
                 ticks.advance()
+        self._come_home()
         return mean_losses(losses[-len(shots) :])
 
     def settle(self, shots: Sequence[Shot], options: FrameOptions, *, usual: float) -> tuple[Losses | None, int]:
@@ -222,6 +235,7 @@ class Solver:
             found = self._iterate(shots, index, near, progress=0.0, rates=rates)
             if near == self.bounds.near:
                 losses[index] = found
+        self._come_home()
         return losses
 
     def _next(self, shots: Sequence[Shot]) -> int:
@@ -240,15 +254,15 @@ class Solver:
         rates: Rates | None = None,
         opaque: bool = False,
     ) -> Losses:
+        """One iteration; its losses are numbers from the next `_come_home` on."""
         options, shot = self._options, shots[index].opened()
         behind = None
         if opaque:
             shot, behind = self._before_colour(shot, self._is_bare(shots))
-        raster = RasterOptions(near, device=options.device)
         rendering = render(
             self._decoded(),
             shot.camera,
-            options=raster,
+            options=RasterOptions(near),
             tiles=shot.tiles,
             arena=self._arena,
             over=self.backdrop.layer(shot.camera, shot.tiles),
@@ -257,16 +271,7 @@ class Solver:
         colour = rendering.colour if behind is None else rendering.colour + (1 - rendering.alpha) * behind
         picture = shot.response.shown(colour)
         found = pulls(
-            Seen(
-                rendering,
-                picture,
-                shot.wanted(picture),
-                shot,
-                self.model.gaussians,
-                moving,
-                self.bounds.radius,
-                options.device,
-            ),
+            Seen(rendering, picture, shot.wanted(picture), shot, self.model.gaussians, moving, self.bounds.radius),
             options,
         )
         drawn = self._carried_back(rendering, found, shot.response, behind)
@@ -296,8 +301,19 @@ class Solver:
     def _is_bare(self, shots: Sequence[Shot]) -> bool:
         """Whether people and things stand before black, judged once."""
         if self._bare is None:
-            self._bare = float(np.mean([_void(shot.target).mean() for shot in shots])) > _BARE
+            self._bare = float(np.mean([self._void_share(shot) for shot in shots])) > _BARE
         return self._bare
+
+    def _void_share(self, shot: Shot) -> float:
+        """Share of the picture that may show nothing."""
+        return float(shot.void.mean())
+
+    def _come_home(self) -> None:
+        """From here on the model is as the iterations so far have left it, and their losses are numbers."""
+
+    def _colour_behind(self) -> np.ndarray:
+        """At random, float32 [3, 1, 1]."""
+        return self._rng.random(3).astype(np.float32)[:, None, None]
 
     def _before_colour(self, shot: Shot, bare: bool) -> tuple[Shot, np.ndarray]:
         """What to explain, and a colour at random behind all Gaussians, float32 [3, H, W].
@@ -306,7 +322,7 @@ class Solver:
         there: that colour is to be seen, or else black Gaussians fill the stage and hide from unseen cameras what is
         on it.
         """
-        void, colour = _void(shot.target), self._rng.random(3).astype(np.float32)[:, None, None]
+        void, colour = shot.void, self._colour_behind()
         if not bare:
             return shot, np.asarray(colour * ~void)
         behind = np.broadcast_to(colour, shot.target.shape).copy()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -34,8 +35,6 @@ class Seen:
     """bool [N], which may change and are seen"""
     radius: float
     """Of the scene"""
-    device: str = "cpu"
-    """Who compares: cpu or cuda"""
 
 
 @dataclass(frozen=True)
@@ -53,15 +52,16 @@ class Pull:
     """float32, by attribute"""
 
 
+Array = TypeVar("Array")
+"""Of numpy or of torch"""
+
 Term = Callable[[Seen, LossOptions], Pull | None]
 """None where the term does not apply"""
 
 
 def photometric(seen: Seen, options: LossOptions) -> Pull | None:
     """L1 and SSIM."""
-    loss = photometric_loss(
-        seen.picture, seen.target, options=options.photometric, tiles=seen.shot.tiles, device=seen.device
-    )
+    loss = photometric_loss(seen.picture, seen.target, options=options.photometric, tiles=seen.shot.tiles)
     return Pull(loss.value, colour=loss.gradient)
 
 
@@ -115,7 +115,7 @@ def pulls(seen: Seen, options: LossOptions) -> dict[str, Pull]:
     return found
 
 
-def summed(parts: Iterable[np.ndarray | None]) -> np.ndarray | None:
+def summed(parts: Iterable[Array | None]) -> Array | None:
     """Sum of those that are there; None if none is."""
-    found = [part for part in parts if part is not None]
+    found: list[Any] = [part for part in parts if part is not None]
     return sum(found[1:], start=found[0]) if found else None

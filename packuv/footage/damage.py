@@ -84,14 +84,18 @@ def damage_told(camera: str, facts: Mapping[str, Any], most: int = 5) -> str:
 
     >>> damage_told("cam1", {"lost": 1, "concealed": 1, "follows": 14, "frames": [[74, 89]]})
     'cam1: 16 pictures are damaged (1 lost, 1 concealed, 14 predicted from those), frames 74-89; they count as missing'
+    >>> damage_told("cam1", {"lost": 0, "concealed": 1, "follows": 0, "frames": [[75, 75]]})
+    'cam1: 1 picture is damaged (1 concealed), frame 75; it counts as missing'
     """
     counts = {"lost": facts["lost"], "concealed": facts["concealed"], "predicted from those": facts["follows"]}
     runs = [f"{first}" if first == last else f"{first}-{last}" for first, last in facts["frames"]]
     more = f" and {len(runs) - most} more runs" if len(runs) > most else ""
     kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     number = sum(counts.values())
-    noun = "picture is" if number == 1 else "pictures are"
-    return f"{camera}: {number} {noun} damaged ({kinds}), frames {', '.join(runs[:most])}{more}; they count as missing"
+    noun, place, those = (
+        ("picture is", "frame", "it counts") if number == 1 else ("pictures are", "frames", "they count")
+    )
+    return f"{camera}: {number} {noun} damaged ({kinds}), {place} {', '.join(runs[:most])}{more}; {those} as missing"
 
 
 def neighbours(frame: int, count: int) -> list[int]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import cv2
 import numpy as np
 
 from packuv.footage.lens import LensCamera
 from packuv.footage.pictures import picture_names
+from packuv.footage.png import MARK, png_size
 from packuv.footage.reader import FrameReader
 from packuv.footage.views import Views
 
@@ -27,9 +29,9 @@ class MaskReader(FrameReader):
 
     def __init__(self, masks: Mapping[str, Path], sizes: Mapping[str, tuple[int, int]]) -> None:
         """`sizes` are widths and heights of the cameras' pictures."""
-        super().__init__(masks)
+        super().__init__(masks, careful=True)
         self._sizes = sizes
-        self._labels = {name: _labels(path) for name, path in self.videos.items()}
+        self._pictures = {name: picture_names(path) if path.is_dir() else [] for name, path in self.videos.items()}
 
     def read(self, camera: str, frame: int) -> np.ndarray:
         """uint8 [H, W, 3], 255 in the foreground and 0 elsewhere.
@@ -37,27 +39,66 @@ class MaskReader(FrameReader):
         Raises what FrameReader does, and ValueError for a mask of another shape than the camera's pictures.
         """
         pixels, (width, height) = self._raw(camera, frame), self._sizes[camera]
-        own_height, own_width = pixels.shape[:2]
-        if abs(own_width * height / (own_height * width) - 1) > SHAPES_APART:
-            raise ValueError(
-                f"{self.videos[camera]} must have masks in the shape of the pictures of {camera}, {width}x{height}, "
-                f"but mask {frame} is {own_width}x{own_height}; make them anew of these pictures, or take them out"
-            )
-        mask = np.where(pixels.max(axis=2, keepdims=True) >= (1 if self._labels[camera] else HALF), 255, 0).astype(
+        self._check_shape(camera, frame, pixels.shape[1], pixels.shape[0])
+        mask = np.where(pixels.max(axis=2, keepdims=True) >= (1 if self._labels(camera) else HALF), 255, 0).astype(
             np.uint8
         )
         resized = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST)
         return np.repeat(resized[:, :, None], 3, axis=2)
 
+    def check(self, camera: str) -> None:
+        """Raise ValueError that names the first mask that is damaged or of another shape than the camera's pictures.
+
+        PNG is looked at by its checksums, all else is decoded.
+        """
+        for frame in range(self.frame_count(camera)):
+            self._check_shape(camera, frame, *self._size_of(camera, frame))
+        if damaged := self.damage(camera):
+            self._refuse(camera, min(damaged), "parts of it cannot be decoded")
+
+    def _size_of(self, camera: str, frame: int) -> tuple[int, int]:
+        """Width and height."""
+        names = self._pictures[camera]
+        file = (self.videos[camera] / names[frame]).read_bytes() if names else b""
+        if not file.startswith(MARK):
+            height, width = super().read(camera, frame).shape[:2]
+            return width, height
+        try:
+            return png_size(file)
+        except ValueError as error:
+            self._refuse(camera, frame, str(error))
+
+    def _check_shape(self, camera: str, frame: int, own_width: int, own_height: int) -> None:
+        width, height = self._sizes[camera]
+        if abs(own_width * height - own_height * width) > SHAPES_APART * own_height * width:
+            raise ValueError(
+                f"{self.videos[camera]} must have masks in the shape of the pictures of {camera}, {width}x{height}, "
+                f"but {self._called(camera, frame)} is {own_width}x{own_height}; make them anew of these pictures, or "
+                "take them out"
+            )
+
+    def _refuse(self, camera: str, frame: int, why: str) -> NoReturn:
+        name = self._called(camera, frame)
+        raise ValueError(f"{self.videos[camera]}: {name} is damaged: {why}; copy it again, or make it anew")
+
+    def _called(self, camera: str, frame: int) -> str:
+        names = self._pictures[camera]
+        return names[frame] if names else f"mask {frame}"
+
     def _raw(self, camera: str, frame: int) -> np.ndarray:
         """[H, W, C] without alpha; of PNG the values in the file, since 16 bits rounded to 8 lose small labels."""
-        if not (names := self._labels[camera]):
+        if not self._labels(camera):
             return super().read(camera, frame)
-        path = self.videos[camera] / names[frame]
+        path = self.videos[camera] / self._pictures[camera][frame]
         pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if pixels is None:
             raise ValueError(f"{path} cannot be decoded; copy it again")
         return np.asarray(np.atleast_3d(pixels)[:, :, :3])
+
+    def _labels(self, camera: str) -> bool:
+        """Whether masks are PNG, and neither JPEG nor video."""
+        names = self._pictures[camera]
+        return bool(names) and names[0].lower().endswith(".png")
 
 
 def foreground(pixels: np.ndarray) -> np.ndarray:
@@ -87,9 +128,3 @@ class Silhouettes:
             return None
         pixels = self._masks.pixels(self._places[camera], instant, remember=False)
         return None if pixels is None else foreground(pixels)
-
-
-def _labels(path: Path) -> list[str]:
-    """Names of PNG files by frame; none where masks are JPEG or video."""
-    names = picture_names(path) if path.is_dir() else []
-    return names if names and names[0].lower().endswith(".png") else []

@@ -72,8 +72,13 @@ class Response:
     def _applied(self, how, picture: np.ndarray) -> np.ndarray:
         prefer_tbb()
         out = np.empty_like(picture)
-        how(picture, np.array(self.factors, _f32), np.array((*self.falloff, *self.grid), _f32), out)
+        how(picture, *self.arrays, out)
         return out
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """What kernels take: factors, float32 [3], and the lens, float32 [6]."""
+        return np.array(self.factors, _f32), np.array((*self.falloff, *self.grid), _f32)
 
 
 PLAIN = Response((1.0, 1.0, 1.0), (0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
@@ -95,8 +100,8 @@ def shading_means(pinhole: PinholeCamera) -> tuple[float, float]:
 
 
 @kernel(inline=True)
-def _shading(lens, x, y):
-    """exp(a r^2 + b r^4) by its series, which is exact to 3e-5 within a factor of e and needs no library call."""
+def shading(lens, x, y):
+    """exp(a r^2 + b r^4) in a pixel, by its series: exact to 3e-5 within a factor of e, and without a library call."""
     across, down = (_f32(x) + _f32(0.5) - lens[2]) * lens[4], (_f32(y) + _f32(0.5) - lens[3]) * lens[5]
     r2 = across * across + down * down
     e = r2 * (lens[0] + lens[1] * r2)
@@ -110,9 +115,9 @@ def _shading(lens, x, y):
 def _show(picture, factors, lens, out):
     for y in prange(picture.shape[1]):
         for x in range(picture.shape[2]):
-            shading = _shading(lens, x, y)
+            local = shading(lens, x, y)
             for c in range(3):
-                value = factors[c] * shading * (picture[c, y, x] + _f32(OFFSET)) - _f32(OFFSET)
+                value = factors[c] * local * (picture[c, y, x] + _f32(OFFSET)) - _f32(OFFSET)
                 out[c, y, x] = min(max(value, _f32(0)), _f32(1))
 
 
@@ -120,15 +125,15 @@ def _show(picture, factors, lens, out):
 def _undo(filmed, factors, lens, out):
     for y in prange(filmed.shape[1]):
         for x in range(filmed.shape[2]):
-            shading = _shading(lens, x, y)
+            local = shading(lens, x, y)
             for c in range(3):
-                out[c, y, x] = (filmed[c, y, x] + _f32(OFFSET)) / (factors[c] * shading) - _f32(OFFSET)
+                out[c, y, x] = (filmed[c, y, x] + _f32(OFFSET)) / (factors[c] * local) - _f32(OFFSET)
 
 
 @kernel(parallel=True)
 def _carry(gradient, factors, lens, out):
     for y in prange(gradient.shape[1]):
         for x in range(gradient.shape[2]):
-            shading = _shading(lens, x, y)
+            local = shading(lens, x, y)
             for c in range(3):
-                out[c, y, x] = factors[c] * shading * gradient[c, y, x]
+                out[c, y, x] = factors[c] * local * gradient[c, y, x]

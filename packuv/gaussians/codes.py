@@ -7,6 +7,7 @@ Positions are 16-bit on a symmetric-log scale about the scene's centre, the rest
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -111,9 +112,7 @@ class Quantizer:
         """Nearest codes; values outside their range saturate, see `saturation`."""
         count, columns = len(gaussians), len(self.low)
         xyz, attributes = np.empty((count, 3), np.uint16), np.empty((count, columns), np.uint8)
-        flat, scale = _flat(gaussians.sh), 255 / (self.high - self.low)
-        place = self.centre, self.unit, self._edge
-        _encode(*arrays(gaussians)[:4], flat, *place, self.low, scale, xyz, attributes)
+        _encode(*arrays(gaussians)[:4], _flat(gaussians.sh), *self.scale, xyz, attributes)
         return Codes(xyz, attributes)
 
     def decode(self, codes: Codes, *, into: Gaussians | None = None) -> Gaussians:
@@ -134,6 +133,11 @@ class Quantizer:
         values, half = attribute_values(gaussians), (self.high - self.low) / 510
         outside = (values < self.low - half) | (values > self.high + half)
         return int(offset.sum() + outside.sum())
+
+    @property
+    def scale(self) -> tuple[np.ndarray, float, np.ndarray, np.ndarray, np.ndarray]:
+        """What `encode_row` takes: centre, unit, edge, low, and codes per unit of each column."""
+        return self.centre, self.unit, self._edge, self.low, 255 / (self.high - self.low)
 
     @property
     def _edge(self) -> np.ndarray:
@@ -177,44 +181,58 @@ def attribute_values(gaussians: Gaussians) -> np.ndarray:
     )
 
 
+# Functions of one row, on the CPU and on a GPU; the latter knows `math` alone.
+
+
+@kernel(inline=True)
+def _step(value, low, per_step):
+    return np.uint8(round(min(max((np.float64(value) - low) * per_step, 0.0), 255.0)))
+
+
+@kernel(inline=True)
+def encode_row(means, log_scales, quaternions, opacity_logits, sh, centre, unit, edge, low, per_step, xyz, attributes,
+               i):  # fmt: skip
+    for axis in range(3):
+        offset = (np.float64(means[i, axis]) - centre[axis]) / unit
+        t = math.copysign(math.log1p(abs(offset)), offset) / edge[axis]
+        xyz[i, axis] = round(min(max((t + 1) * 32767.5, 0.0), 65535.0))
+        attributes[i, axis] = _step(log_scales[i, axis], low[axis], per_step[axis])
+    w, x = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1])
+    y, z = np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
+    length = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    sign = (-1.0 if w < 0 else 1.0) / length
+    attributes[i, 3] = _step(x * sign, low[3], per_step[3])
+    attributes[i, 4] = _step(y * sign, low[4], per_step[4])
+    attributes[i, 5] = _step(z * sign, low[5], per_step[5])
+    attributes[i, 6] = _step(opacity_logits[i], low[6], per_step[6])
+    for k in range(sh.shape[1]):
+        attributes[i, 7 + k] = _step(sh[i, k], low[7 + k], per_step[7 + k])
+
+
+@kernel(inline=True)
+def decode_row(xyz, attributes, xyz_table, table, means, log_scales, quaternions, opacity_logits, sh, i):
+    for axis in range(3):
+        means[i, axis] = xyz_table[axis, xyz[i, axis]]
+        log_scales[i, axis] = table[axis, attributes[i, axis]]
+    x, y, z = table[3, attributes[i, 3]], table[4, attributes[i, 4]], table[5, attributes[i, 5]]
+    # In float64, so that no contraction of multiply and add can change the rounded result.
+    rest = 1.0 - (np.float64(x) * x + np.float64(y) * y + np.float64(z) * z)
+    quaternions[i, 0] = np.float32(math.sqrt(max(rest, 0.0)))
+    quaternions[i, 1], quaternions[i, 2], quaternions[i, 3] = x, y, z
+    opacity_logits[i] = table[6, attributes[i, 6]]
+    for k in range(sh.shape[1]):
+        sh[i, k] = table[7 + k, attributes[i, 7 + k]]
+
+
 @kernel(parallel=True)
 def _encode(means, log_scales, quaternions, opacity_logits, sh, centre, unit, edge, low, per_step, xyz, attributes):
     for row in prange(len(means)):
-        i = np.int64(row)
-        for axis in range(3):
-            offset = (np.float64(means[i, axis]) - centre[axis]) / unit
-            t = np.copysign(np.log1p(abs(offset)), offset) / edge[axis]
-            xyz[i, axis] = min(max(np.rint((t + 1) * 32767.5), 0.0), 65535.0)
-            attributes[i, axis] = _step(log_scales[i, axis], low[axis], per_step[axis])
-        w, x = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1])
-        y, z = np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
-        length = max(np.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-        sign = (-1.0 if w < 0 else 1.0) / length
-        attributes[i, 3] = _step(x * sign, low[3], per_step[3])
-        attributes[i, 4] = _step(y * sign, low[4], per_step[4])
-        attributes[i, 5] = _step(z * sign, low[5], per_step[5])
-        attributes[i, 6] = _step(opacity_logits[i], low[6], per_step[6])
-        for k in range(sh.shape[1]):
-            attributes[i, 7 + k] = _step(sh[i, k], low[7 + k], per_step[7 + k])
-
-
-@kernel(inner=True)
-def _step(value, low, per_step):
-    return np.uint8(min(max(np.rint((np.float64(value) - low) * per_step), 0.0), 255.0))
+        encode_row(means, log_scales, quaternions, opacity_logits, sh, centre, unit, edge, low, per_step, xyz,
+                   attributes, np.int64(row))  # fmt: skip
 
 
 @kernel(parallel=True)
 def _decode(xyz, attributes, xyz_table, table, means, log_scales, quaternions, opacity_logits, sh):
     for row in prange(len(xyz)):
-        i = np.int64(row)
-        for axis in range(3):
-            means[i, axis] = xyz_table[axis, xyz[i, axis]]
-            log_scales[i, axis] = table[axis, attributes[i, axis]]
-        x, y, z = table[3, attributes[i, 3]], table[4, attributes[i, 4]], table[5, attributes[i, 5]]
-        # In float64, so that no contraction of multiply and add can change the rounded result.
-        rest = 1.0 - (np.float64(x) * x + np.float64(y) * y + np.float64(z) * z)
-        quaternions[i, 0] = np.float32(np.sqrt(max(rest, 0.0)))
-        quaternions[i, 1], quaternions[i, 2], quaternions[i, 3] = x, y, z
-        opacity_logits[i] = table[6, attributes[i, 6]]
-        for k in range(sh.shape[1]):
-            sh[i, k] = table[7 + k, attributes[i, 7 + k]]
+        decode_row(xyz, attributes, xyz_table, table, means, log_scales, quaternions, opacity_logits, sh,
+                   np.int64(row))  # fmt: skip

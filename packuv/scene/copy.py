@@ -30,6 +30,13 @@ _END = struct.Struct("<32sQQ16s")
 """SHA-256 of what precedes, bytes of the deflated header and of the deflated places, and the magic"""
 
 
+DAMAGED = "the second copy of its header is damaged; copy the file again while the first one is whole"
+
+
+class CopyDamageError(ValueError):
+    """The copy is there, but is not what was written."""
+
+
 @dataclass(frozen=True)
 class Copy:
     """What the copy says."""
@@ -75,18 +82,21 @@ def _grow_segment(file: BinaryIO, count: int) -> None:
 
 
 def read_copy(file: BinaryIO) -> Copy | None:
-    """The copy, if the file ends with a whole one."""
+    """The copy, if the file ends with one; raises CopyDamageError for one whose bytes are not those that were
+    written."""
     end = file.seek(0, os.SEEK_END) - _END.size
     if end < 0:
         return None
     file.seek(end)
     digest, *sizes, magic = _END.unpack(file.read())
-    if magic != MAGIC or sum(sizes) > min(end, 2 * bounds.MOST_JSON_BYTES):
+    if magic != MAGIC:
         return None
+    if sum(sizes) > min(end, 2 * bounds.MOST_JSON_BYTES):
+        raise CopyDamageError(DAMAGED)
     file.seek(end - sum(sizes))
     packed = file.read(sum(sizes))
     if hashlib.sha256(packed).digest() != digest:
-        return None
+        raise CopyDamageError(DAMAGED)
     try:
         return _decode(packed[: sizes[0]], packed[sizes[0] :], end)
     except (ValueError, zlib.error):

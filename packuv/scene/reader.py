@@ -64,6 +64,11 @@ class Scene:
         return self.index.header
 
     @property
+    def damage(self) -> str:
+        """What is wrong with the header or its second copy, of which the other was read; empty if nothing is."""
+        return self._source.damage
+
+    @property
     def lossless(self) -> bool:
         """Whether its codes are those that were fitted."""
         return self.index.tolerance.exact and COMPRESSION not in self.header.extra

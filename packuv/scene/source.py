@@ -8,9 +8,11 @@ import os
 import zlib
 from pathlib import Path
 
-from packuv.scene.copy import Copy, read_copy
+from packuv.scene.copy import Copy, CopyDamageError, read_copy
 from packuv.scene.header import CHECKSUM, HEADER, HeaderDamageError, SceneIndex
 from packuv.scene.matroska import Decoder, FoundPacket, Reader
+
+FROM_COPY = "the second copy was read; copy the file again while that is whole"
 
 
 class Source:
@@ -23,7 +25,13 @@ class Source:
     def __init__(self, path: Path) -> None:
         self._path = Path(path)
         self._file = self._path.open("rb")
-        self._copy = read_copy(self._file)
+        self._copy: Copy | None = None
+        self.damage = ""
+        """What is wrong with the header or its second copy, of which the other was read; empty if nothing is"""
+        try:
+            self._copy = read_copy(self._file)
+        except CopyDamageError as error:
+            self.damage = f"{self._path}: {error}"
         self._reader: Reader | None = None
         self.index = self._read_index()
         self._times_ms = self.index.header.times_ms
@@ -88,6 +96,7 @@ class Source:
             with contextlib.suppress(ValueError):
                 index = SceneIndex.decode({HEADER: self._copy.header, CHECKSUM: checksum})
                 if _has_places(self._copy, index):
+                    self.damage = f"{error}; {FROM_COPY}"
                     return index
         self.close()
         raise ValueError(str(error)) from None

@@ -25,10 +25,12 @@ class VerifyReport:
     """Track of the first packet that is damaged, empty if none is"""
     span: tuple[int, int] | None = None
     """Bytes of that packet in the file, half-open, unless it is missing"""
+    header: str = ""
+    """What is wrong with the header or its second copy, of which the other was read; costs no frame"""
 
     @property
     def ok(self) -> bool:
-        return not self.bad
+        return not (self.bad or self.header)
 
 
 def verify_scene(path: Path, *, threads: int = 0, progress: Progress = no_progress) -> VerifyReport:
@@ -44,12 +46,12 @@ def verify_scene(path: Path, *, threads: int = 0, progress: Progress = no_progre
                 if trouble:
                     found.append((frame, trouble))
                 progress(frame + 1, len(scene))
-        count = len(scene)
+        count, header = len(scene), scene.damage
     if not found:
-        return VerifyReport(count)
+        return VerifyReport(count, problem=header, header=header)
     first = found[0][1]
     where = (TRACK_NAMES[first.address.track], first.span) if isinstance(first, DamageError) else ("", None)
-    return VerifyReport(count, tuple(frame for frame, _ in found), str(first), *where)
+    return VerifyReport(count, tuple(frame for frame, _ in found), str(first), *where, header)
 
 
 def _check_frames(scene: Scene, segment: SegmentEntry) -> Iterator[tuple[int, ValueError | None]]:

@@ -20,7 +20,7 @@ from pipelines.options import compose
 from pipelines.register import find_runs
 from pipelines.request import RunRequest
 from pipelines.stages import Sequence  # which imports every stage
-from sync.capture import SETTINGS, Capture, CaptureSettings, find_capture
+from sync.capture import SETTINGS, Capture, CaptureSettings, find_capture, find_lender, find_masks, find_plate
 from tasks.artefacts.digests import signature
 from tasks.artefacts.recipe import digest, plain
 from tasks.artefacts.retention import RUN
@@ -178,13 +178,18 @@ def _capture_digest(folder: Path) -> str:
 
 
 def _raw_files(capture: Capture) -> Iterator[Path]:
-    yield from capture.videos.values()
-    yield from capture.timecodes.values()
+    """All that a run of it reads, of the take whose rig it uses, too; raises as `find_lender` and `find_masks` do."""
+    for by_camera in (capture.videos, capture.timecodes, find_masks(capture), find_plate(capture)):
+        yield from by_camera.values()
     if (capture.folder / SETTINGS).is_file():
         yield capture.folder / SETTINGS
     if capture.calibration is not None:
         yield from [path for path in capture.calibration.rglob("*") if path.is_file()]
         yield capture.calibration
+    if capture.offsets is not None:
+        yield capture.offsets
+    if (lender := find_lender(capture)) is not None:
+        yield from _raw_files(lender)
 
 
 def _result_digest(path: Path) -> str:

@@ -9,7 +9,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from packuv.camera import PinholeCamera
     from packuv.footage import Views
     from packuv.scene import SceneHeader
+    from packuv.scene.verify import VerifyReport
 
 MOST_STARTS = 16
 """First frames of segments that `packuv info` names"""
@@ -148,10 +149,17 @@ def _verify_scene(arguments: argparse.Namespace) -> int:
     with shown(arguments, "verify") as progress:
         report = verify_scene(arguments.scene, progress=progress)
     facts = {**vars(report), "ok": report.ok}
-    good = f"{arguments.scene}: all {report.frames} frames decode to exactly what was written"
-    bad = f"{arguments.scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
-    print_facts(facts, arguments.json, lambda _: good if report.ok else bad)
+    print_facts(facts, arguments.json, lambda _: "\n".join(_verify_lines(arguments.scene, report)))
     return 0 if report.ok else 1
+
+
+def _verify_lines(scene: Path, report: VerifyReport) -> Iterator[str]:
+    if report.header:
+        yield f"damaged    {report.header}"
+    if report.bad:
+        yield f"{scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
+    else:
+        yield f"{scene}: all {report.frames} frames decode to exactly what was written"
 
 
 def _verify_store(arguments: argparse.Namespace) -> int:
@@ -234,11 +242,15 @@ def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
 
 def evaluate(arguments: argparse.Namespace) -> int:
     """`packuv eval`: every frame against what cameras filmed, by the definitions of docs/scores.md."""
+    from packuv.fit.device import choose_device
     from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
 
+    device = choose_device(arguments.device)
     options = EvaluateOptions(lpips_weights=arguments.lpips_weights)
     with shown(arguments, "evaluate") as progress:
-        facts = evaluate_scene(arguments.scene, arguments.capture, arguments.cameras, options, progress=progress)
+        facts = evaluate_scene(
+            arguments.scene, arguments.capture, arguments.cameras, options, progress=progress, device=device
+        )
     print_facts(facts, arguments.json, _scores_text)
     return 0
 

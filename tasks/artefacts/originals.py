@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from sync.capture import SETTINGS, Capture, find_capture
+from sync.capture import SETTINGS, Capture, find_capture, find_masks
 from tasks.artefacts.digests import FileDigests, Signature, signature
 
 ADVICE = "put back what was there, or run the same command again to process what is there now"
@@ -25,8 +25,10 @@ class Originals:
     """Raw files of one capture, which must stay what they are while a run goes on. Safe to use from several threads."""
 
     def __init__(self, capture: Capture, memory: Path) -> None:
+        """Raises ValueError for masks of what is no camera."""
         self.capture = capture
         """As it was when the run began"""
+        self._files = _files(capture)
         self._digests = FileDigests(memory)
         self._sha256: dict[Path, str] = {}
         self._lock = threading.Lock()
@@ -60,8 +62,9 @@ class Originals:
         now = find_capture(self.capture.folder)
         if now.settings != self.capture.settings:
             raise ValueError(f"{now.folder / SETTINGS} says something else than when this run began; {ADVICE}")
-        for path in sorted(_files(now) ^ _files(self.capture)):
-            what = "was added" if path in _files(now) else "has gone"
+        there = _files(now)
+        for path in sorted(there ^ self._files):
+            what = "was added" if path in there else "has gone"
             raise ValueError(f"{path} {what} since this run began; {ADVICE}")
         if replace(now, name=self.capture.name) != self.capture:  # a run may give it another name
             raise ValueError(f"{now.folder} has another calibration than when this run began; {ADVICE}")
@@ -71,7 +74,8 @@ class Originals:
 
 
 def _files(capture: Capture) -> set[Path]:
-    return {*capture.videos.values(), *capture.timecodes.values()}
+    """Those by camera, as they are now; raises ValueError for masks of what is no camera."""
+    return {*capture.videos.values(), *capture.timecodes.values(), *find_masks(capture).values()}
 
 
 def _signature(path: Path) -> Signature:

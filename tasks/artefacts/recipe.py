@@ -23,21 +23,25 @@ from tasks.artefacts import recipe
 
 T = TypeVar("T")
 
+INTERCHANGEABLE = "in every recipe"
+"""Metadata of a dataclass's field: the value that stands in a recipe whatever the field's is, since results are alike
+within a tolerance that is checked"""
+
 
 class OptionError(ValueError):
     """An option has a wrong name or a value of the wrong kind."""
 
 
-def plain(value: Any, *, where: str = "recipe") -> Any:
+def plain(value: Any, *, where: str = "recipe", decisive: bool = False) -> Any:
     """The value as None, bool, int, float, str, list and dict.
 
     Dataclasses become dicts, tuples lists, enums their values, fractions "3/2". -0.0 becomes 0.0, since they are
-    equal. Raises TypeError that names the place for what has no plain form: a path (its content decides, not its
-    name), NaN and infinity, an array.
+    equal. If `decisive`, fields that are `INTERCHANGEABLE` have the value that stands for all. Raises TypeError that
+    names the place for what has no plain form: a path (its content decides, not its name), NaN and infinity, an array.
     """
     match value:
         case Enum():
-            return plain(value.value, where=where)
+            return plain(value.value, where=where, decisive=decisive)
         case None | bool() | str():
             return value
         case int():
@@ -47,11 +51,16 @@ def plain(value: Any, *, where: str = "recipe") -> Any:
         case Fraction():
             return f"{value.numerator}/{value.denominator}"
         case Mapping():
-            return {_name(key, where): plain(item, where=f"{where}.{key}") for key, item in value.items()}
+            return {
+                _name(key, where): plain(item, where=f"{where}.{key}", decisive=decisive) for key, item in value.items()
+            }
         case list() | tuple():
-            return [plain(item, where=f"{where}[{index}]") for index, item in enumerate(value)]
+            return [plain(item, where=f"{where}[{index}]", decisive=decisive) for index, item in enumerate(value)]
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name), where=f"{where}.{f.name}") for f in fields(value)}
+        items = {f.name: getattr(value, f.name) for f in fields(value)}
+        if decisive:
+            items |= {f.name: f.metadata[INTERCHANGEABLE] for f in fields(value) if INTERCHANGEABLE in f.metadata}
+        return plain(items, where=where, decisive=decisive)
     raise TypeError(f"{where}: {value!r} has no place in a recipe; give numbers, text, or the digest of a file")
 
 

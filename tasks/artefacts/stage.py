@@ -15,9 +15,10 @@ values; so a stage can be pickled, and its job can run on another machine.
 
 from __future__ import annotations
 
+import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,6 +28,9 @@ from tasks.artefacts.store import Key, Store
 
 BASE_BYTES = 1_000_000_000
 """Of a job beside pictures and layers: the libraries, the Gaussians and what the optimizer keeps of them"""
+
+NO_GPU = "no_gpu"
+"""Note of a job that should have used a GPU: why it did not"""
 
 Notes = Mapping[str, Any]
 """What a stage says about its work, for the receipt; plain values"""
@@ -113,8 +117,19 @@ class Stage(ABC):
         """What its job takes there, roughly: the memory is that of the site and what any program takes."""
         if self.small:
             return Needs(1, BASE_BYTES)
-        on_gpu = any(getattr(value, "device", "cpu") == "cuda" for value in self.settings.values())
-        return Needs(site.threads, site.memory_bytes + BASE_BYTES, int(on_gpu))
+        return Needs(site.threads, site.memory_bytes + BASE_BYTES, int(self.on_gpu))
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether it or its options say so."""
+        return "cuda" in (getattr(value, "device", "cpu") for value in (self, *self.settings.values()))
+
+    @property
+    def on_cpu(self) -> Stage:
+        """The same without a GPU: it makes the same artefact."""
+        mine = {field.name: getattr(self, field.name) for field in fields(self)}
+        changes = {name: replace(value, device="cpu") for name, value in mine.items() if hasattr(value, "device")}
+        return replace(self, **changes, **({"device": "cpu"} if "device" in mine else {}))
 
     def spared(self, folder: Path, notes: Notes) -> Iterable[tuple[str, str]]:
         """Work that this sequence did not need, as (what, why), told by the artefact."""
@@ -149,7 +164,24 @@ class StageJob:
         return self.stage.label
 
     def __call__(self, progress: Progress) -> Notes:
-        return self.stage.build(Work(self.site, self.out, self.scratch, progress))
+        work = Work(self.site, self.out, self.scratch, progress)
+        if not self.stage.on_gpu:
+            return self.stage.build(work)
+        try:
+            return {**self.stage.build(work), "device": "cuda"}
+        except Exception as error:  # of whichever library asked for the memory
+            if not _gpu_is_full(error):
+                raise
+            why = f"its memory was used up ({str(error).splitlines()[0]}), so the CPU did it"
+        for left in self.out.iterdir():
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
+        return {**self.stage.on_cpu.build(work), "device": "cpu", NO_GPU: why}
+
+
+def _gpu_is_full(error: Exception) -> bool:
+    from packuv.fit.device import gpu_is_full  # late, for it takes a second to load
+
+    return gpu_is_full(error)
 
 
 def _names_artefacts(value: Any) -> bool:

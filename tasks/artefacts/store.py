@@ -557,7 +557,7 @@ def _recipe(stage: str, version: int, options: Any, inputs: Mapping[str, Any]) -
     return {
         "stage": stage,
         "version": version,
-        "options": recipe.plain(options, where="options"),
+        "options": recipe.plain(options, where="options", decisive=True),
         "inputs": recipe.plain(named(inputs), where="inputs"),
     }
 

@@ -13,7 +13,7 @@ from packuv.progress import Progress, no_progress
 from sync.capture import Capture
 from tasks.artefacts.jobs import Jobs, end_leftovers
 from tasks.artefacts.originals import Originals
-from tasks.artefacts.stage import Files, Notes, Site, Stage, StageJob
+from tasks.artefacts.stage import NO_GPU, Files, Notes, Site, Stage, StageJob
 from tasks.artefacts.store import Building, Key, Store
 
 
@@ -94,8 +94,11 @@ class Workshop:
             self.listener.failed(stage.label, error)
             raise
         self.listener.finished(stage.label, key, time.monotonic() - start)
-        for what, why in stage.spared(self.path(key), self.store.receipt(key).notes):
+        notes = self.store.receipt(key).notes
+        for what, why in stage.spared(self.path(key), notes):
             self.listener.skipped(what, why)
+        if NO_GPU in notes:
+            self.listener.skipped(f"GPU for {stage.label}", notes[NO_GPU])
         return key
 
     def path(self, key: Key) -> Path:

@@ -46,6 +46,8 @@ class Finding:
     """That it is about; empty for none, or several"""
     many: str = ""
     """What several cameras with this finding have in common, as "cameras dropped frames"; such ones become one line"""
+    figure: str = ""
+    """What was measured of the camera, as short as that line needs it"""
 
 
 def findings(report: ReportInput, limits: Limits = LIMITS) -> tuple[Finding, ...]:
@@ -76,7 +78,7 @@ def _grouped(found: tuple[Finding, ...]) -> list[Finding]:
 
 
 def _joined(own: list[Finding]) -> Finding:
-    names = [finding.camera for finding in own]
+    names = [f"{finding.camera} ({finding.figure})" if finding.figure else finding.camera for finding in own]
     more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
     text = f"{len(own)} {own[0].many}: {', '.join(names[:MOST_NAMES])}{more}."
     return replace(own[0], text=text, evidence=tuple(finding.text for finding in own), camera="")
@@ -114,6 +116,7 @@ def _sync_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
                 cure="See whether it started late or its clock is off; --frames can leave the gap out.",
                 camera=row.camera,
                 many="cameras have frames at too few instants",
+                figure=f"{row.matched_share:.0%}",
             )
         if row.drops > limits.drop_share * max(1, row.lines):
             yield Finding(
@@ -122,6 +125,7 @@ def _sync_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
                 cure="Look at the recorder's network and disk before the next take; the fit does without these frames.",
                 camera=row.camera,
                 many="cameras dropped frames",
+                figure=f"{row.drops}",
             )
         if row.residual_p95_ns > limits.residual_share * report.sync.period_ns > 0:
             late = row.residual_p95_ns / report.sync.period_ns
@@ -131,6 +135,7 @@ def _sync_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
                 cure="Synchronize shutters (genlock); with cameras that run freely try --clock triggered or content.",
                 camera=row.camera,
                 many="cameras film beside the instants of the reference",
+                figure=f"{late:.2f} periods",
             )
     yield from (Finding("sync", f"{note}.") for note in report.sync.notes)
 
@@ -198,6 +203,7 @@ def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
                 "The renderer allows for it; set exposure and white balance alike before the next take.",
                 camera=camera.name,
                 many=f"cameras need a colour gain beyond {limits.gain:g} or 1/{limits.gain:g}",
+                figure=f"{worst:.2f}",
             )
         light = float(corner_light(np.array(camera.shading)))
         if limits.odd_corner(light):
@@ -207,6 +213,7 @@ def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
                 cure="Compare its corners in truth and render; its points there may say too little.",
                 camera=camera.name,
                 many="cameras seem to have odd light in the corner",
+                figure=f"{light:.0%}",
             )
     for name, why in report.unlike.items():
         text = f"{name} keeps its colours as filmed: {why}."
@@ -254,6 +261,7 @@ def _light_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
                 cure="Turn its automatic exposure off before the next take.",
                 camera=camera,
                 many="cameras change their exposure at once; fit and scores allow for it",
+                figure=f"{factor:.2f}",
             )
 
 
@@ -298,6 +306,7 @@ def _score_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
                 cure="See its rows in synchronization, camera layout and colour balance.",
                 camera=name,
                 many=f"cameras score {limits.camera_drop_db:g} dB or more below the median camera",
+                figure=f"{level:.1f} dB",
             )
     frames = mean_by_frame(report.scores)
     usual = float(np.median(list(frames.values())))

@@ -287,6 +287,19 @@ def find_rig(
     return ImportRig(take=take, first=plan.first, files=files, options=options)
 
 
+def check_given(source: Path | None, groups: Path, cameras: tuple[str, ...], first: int) -> None:
+    """Raise what the stage of `find_rig` raises before it looks at pictures: of a calibration that cannot be read, or
+    not for videos of these sizes, or where no instant is there to solve from; `groups` is a sync artefact."""
+    videos = read_videos(groups)
+    sizes = {name: (videos[name]["width"], videos[name]["height"]) for name in cameras}
+    if source is not None and not holds_lenses_alone(source):
+        fitted(load_rig(source, cameras, sizes), sizes)
+        return
+    if source is not None:
+        load_lenses(source, cameras, sizes)
+    complete_instants(FrameGroups.load(groups), cameras, first)
+
+
 def borrow_rig(
     workshop: Workshop,
     plan: Plan,

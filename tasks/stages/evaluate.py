@@ -72,6 +72,8 @@ class Evaluate(Stage):
     """Path of the backbone's weights"""
     no_lpips: str = dataclasses.field(default="", compare=False)
     """Why LPIPS is not measured"""
+    device: str = dataclasses.field(default="cpu", compare=False)
+    """Who draws: cpu or cuda"""
 
     def build(self, work: Work) -> Notes:
         footage, scene = Footage(self.take, work.site), work.path(self.scene) / SCENE
@@ -80,7 +82,7 @@ class Evaluate(Stage):
         lpips = Lpips(Path(self.weights)) if self.backbone else None
         with open_scene(scene) as opened:
             scores = score(opened, views, work.progress, lpips=lpips, silhouettes=silhouettes,
-                           workers=work.site.threads, scratch=work.scratch)  # fmt: skip
+                           workers=work.site.threads, scratch=work.scratch, device=self.device)  # fmt: skip
             write_table(work.out / TABLE, scores)
             write_pictures(work.out / PICTURES, opened, views, frames_to_picture(frame_scores(scores)))
             borders = segment_starts(opened)
@@ -117,9 +119,16 @@ def fitted_scores(metrics: Mapping[str, Any]) -> tuple[FrameScore, ...]:
 
 
 def evaluate_scene(
-    scene: Path, capture: Path, cameras: Sequence[str] | None, options: EvaluateOptions, progress: Progress
+    scene: Path,
+    capture: Path,
+    cameras: Sequence[str] | None,
+    options: EvaluateOptions,
+    progress: Progress,
+    *,
+    device: str = "cpu",
 ) -> dict[str, Any]:
-    """Score a scene file against a capture folder, without a store; the summary that `evaluate` writes.
+    """Score a scene file against a capture folder, without a store; the summary that `evaluate` writes. `device`, cpu
+    or cuda, draws.
 
     The frames of the capture are matched again as the scene's header says, and found by their times. Raises
     ValueError for a camera that the scene does not know, or a capture that did not film the scene's instants; where
@@ -138,7 +147,8 @@ def evaluate_scene(
             raise ValueError(f"the scene has no camera {', '.join(unknown)}; it has {', '.join(lenses)}")
         views = filmed_views(header, capture, names)
         silhouettes, doubtful = _silhouettes(capture, views)
-        scores = score(opened, views, progress, lpips=Lpips(weights) if weights else None, silhouettes=silhouettes)
+        lpips = Lpips(weights) if weights else None
+        scores = score(opened, views, progress, lpips=lpips, silhouettes=silhouettes, device=device)
         facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
         return {**facts, "doubtful_masks": doubtful} if doubtful else facts
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from packuv.files import save_json
+from packuv.footage import MaskReader
 from packuv.motion import MotionBackend, MotionCache, MotionOptions, measure_motion
 from packuv.motion.foreground import compare_masks
-from sync.capture import check_masks, find_capture
+from sync.capture import check_masks, find_capture, find_masks
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.stages.footage import Footage, Take
-from tasks.stages.synchronize import read_videos
 from tasks.stages.track import MOTION
 
 AGREEMENT = "masks.json"
@@ -29,11 +29,12 @@ EMPTY, FULL = 1e-4, 0.98
 
 @dataclass(frozen=True, kw_only=True)
 class MatchMasks(Stage):
-    """See whether masks have the count, numbers and shape of their cameras' pictures; raises ValueError if not."""
+    """See whether masks are whole, with the count, numbers and shape of their cameras' pictures; raises ValueError if
+    not. It needs nothing, and nothing is made of it: what does not fit shall be known before anything else is done."""
 
-    name, version = "mask_files", 1
-    small = True
-    groups: Key
+    name, version = "mask_files", 2
+    videos: Files
+    """Of the cameras with masks"""
     masks: Files
     """By camera, held-out ones, too"""
 
@@ -42,8 +43,16 @@ class MatchMasks(Stage):
         return "mask files"
 
     def build(self, work: Work) -> Notes:
-        check_masks(find_capture(work.site.capture), read_videos(work.path(self.groups)))
-        return {"cameras": list(self.masks.sha256)}
+        capture, cameras = find_capture(work.site.capture), list(self.masks.sha256)
+
+        def check(camera: str) -> None:
+            size = check_masks(capture, camera)
+            MaskReader({camera: find_masks(capture)[camera]}, {camera: size}).check(camera)
+
+        with ThreadPoolExecutor(work.site.threads) as pool:
+            for done, _ in enumerate(pool.map(check, cameras)):
+                work.progress(done + 1, len(cameras))
+        return {"cameras": cameras}
 
 
 @dataclass(frozen=True, kw_only=True)

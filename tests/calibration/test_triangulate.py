@@ -215,6 +215,9 @@ def test_pictures_must_fit_the_rig():
     grey = {name: np.full_like(picture, 90) for name, picture in pictures.items()}
     with pytest.raises(ValueError, match="none was found in 1 instants"):
         triangulate(rig, [grey])
+    two = rig.names[:2]
+    with pytest.raises(ValueError, match=r"seen by 3 cameras \(min_views\), but there are 2"):
+        triangulate(rig.select(two), [{name: pictures[name] for name in two}], options=OPTIONS)
     with pytest.raises(ValueError, match="at least two views"):
         TriangulateOptions(min_views=1)
 

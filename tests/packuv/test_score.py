@@ -18,6 +18,7 @@ from packuv.gaussians.floats import with_canonical_axes
 from packuv.gaussians.segment import Segment
 from packuv.metrics import cut_out, psnr, ssim
 from packuv.progress import no_progress
+from packuv.raster import render
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.score import (
     BLOCKS,
@@ -104,6 +105,21 @@ def scores_of(path, video, light):
     views = Views({"a": video}, np.arange(3)[:, None], [LensCamera(CAMERA)], light=light)
     with open_scene(path) as scene:
         return score(scene, views, no_progress)
+
+
+def test_the_device_draws_what_is_scored(tmp_path, monkeypatch):
+    path, asked = write_wall(tmp_path / "steady.mkv", 0 * LIGHT), []
+
+    def drawn(*given, options, **named):
+        asked.append(options.device)
+        return render(*given, options=replace(options, device="cpu"), **named)
+
+    monkeypatch.setattr("packuv.score.render", drawn)
+    with open_scene(path) as scene:
+        film(tmp_path / "a.mp4", [Artist(scene).draw(scene.gaussians(0), CAMERA)] * 3)
+        views = Views({"a": tmp_path / "a.mp4"}, np.arange(3)[:, None], [LensCamera(CAMERA)])
+        score(scene, views, no_progress, device="cuda")
+    assert asked == ["cpu", "cuda", "cuda", "cuda"]
 
 
 def test_raw_scores_are_those_of_the_scene_in_its_light(tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from pipelines.batch.plan import _capture_digest
 from pipelines.batch.request import BatchRequest
 from pipelines.batch.resources import sequences_at_once
 from pipelines.batch.table import Result, ResultTable, Status
@@ -103,6 +104,33 @@ def test_one_that_fails_harms_no_other_and_again_does_only_what_changed(dataset,
         "day1-dance": "there already",
         "day2-dance": "there already",
     }
+
+
+def test_a_change_of_anything_that_a_run_reads_makes_it_run_again(tmp_path):
+    take, first, plate = (tmp_path / name for name in ("take", "first", "empty"))
+    for folder in (take, first, plate):
+        for camera in ("cam1", "cam2"):
+            (folder / "videos").mkdir(parents=True, exist_ok=True)
+            (folder / "videos" / f"{camera}.mp4").touch()
+    (take / "capture.toml").write_text('rig_from = "first"\nclean_plate = "empty"\n')
+    (first / "calibration").mkdir()
+    seen = [_capture_digest(take)]
+    for name in (
+        "take/masks/cam1/000000.png",
+        "take/masks/cam1/000001.png",
+        "take/timecodes/cam1.csv",
+        "take/t_offsets.json",
+        "first/calibration/rig.json",
+        "empty/videos/cam1.mp4",
+    ):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(name)
+        seen.append(_capture_digest(take))
+    shutil.rmtree(take / "masks")
+    seen.append(_capture_digest(take))
+    assert len(set(seen)) == len(seen)
+    assert all(seen)
 
 
 def test_sequences_are_chosen_by_name_and_tag(manifest, tmp_path, capsys):

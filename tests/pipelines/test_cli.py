@@ -24,8 +24,18 @@ from tests.packuv.test_score import LIGHT, write_wall
         (["frob"], "invalid choice: 'frob'"),
         (["run", "capture"], "the following arguments are required: --out"),
         (["run", "capture", "--out", "o", "--preset", "best"], "invalid choice: 'best'"),
-        (["run", "capture", "--out", "o", "--frames", "3:1"], "must be A:B with A < B, as 0:30"),
-        (["run", "capture", "--out", "o", "--frames", "three"], "must be A:B with A < B"),
+        (["run", "capture", "--out", "o", "--frames", "3:1"], "must be A:B with 0 <= A < B, as 0:30"),
+        (["run", "capture", "--out", "o", "--frames", "three"], "must be A:B with 0 <= A < B"),
+        (["plan", "capture", "--out", "o", "--frames", "-3"], "must be A:B with 0 <= A < B"),
+        *(
+            ([*words, "--frames", "-1:3"], "must be A:B with 0 <= A < B, as 0:30 for the first thirty, but is '-1:3'")
+            for words in (
+                ["run", "capture", "--out", "o"],
+                ["batch", "a.parquet", "--out", "o"],
+                ["export", "a.mkv", "-o", "d"],
+                ["render", "a.mkv", "--camera", "a", "-o", "d"],
+            )
+        ),
         (["run", "capture", "--out", "o", "--jobs", "0"], "must be a whole number from 1 on, but is '0'"),
         (["run", "capture", "--out", "o", "--unknown"], "unrecognized arguments: --unknown"),
         (["run", "capture", "--out", "o", "--dir"], "unrecognized arguments: --dir"),

@@ -49,6 +49,7 @@ def test_more_frames_cameras_or_pixels_never_take_less(size, machine, name):
         replace(size, fitted=(*size.fitted, max(size.fitted, key=lambda side: side[0] * side[1]))),
         replace(size, held_out=(*size.held_out, (640, 360))),
         replace(size, fitted=larger),
+        replace(size, solved=True),
     ]
     for other in more:
         found = forecast(other, POINTS[name], machine)

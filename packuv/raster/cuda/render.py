@@ -1,6 +1,7 @@
 """The CUDA rasterizer's host side: it holds the tensors and runs the kernels in order.
 
-Arrays come and go as numpy's, so that callers need not know where they are drawn. Sums have one order, so that two
+`forward` and `backward` take and give numpy's arrays, so that callers need not know where they are drawn; `draw` and
+`carry` are the same for tensors that stay on the GPU. Sums have one order, so that two
 runs on one GPU give the same bytes; they are not those of the CPU, which adds and rounds in another order.
 """
 
@@ -51,8 +52,8 @@ class _Listed:
     """int32 [N]: pairs of each Gaussian"""
     first_pair: Tensor
     """int64 [N + 1]: bounds of each Gaussian's slots"""
-    invalid_count: int
-    """Gaussians that are skipped"""
+    invalid: Tensor
+    """int32 [1]: Gaussians that are skipped"""
 
 
 @dataclass(frozen=True)
@@ -71,15 +72,24 @@ class _Drawn:
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """What the gradients need of a rendering."""
+class OnGpu:
+    """A rendering that stays on the GPU, with what its gradients need."""
 
     fields: tuple[Tensor, ...]
+    """As the arrays of `Gaussians`"""
     view: Tensor
     sh_degree: int
     own: _Listed
     drawn: _Drawn
     pictures: tuple[Tensor, Tensor, Tensor]
+    """Colour [3, H, W], depth and alpha [H, W], float32"""
+    shares: Tensor
+    """float32 by slot: what each pair shows, if asked for"""
+
+    @property
+    def visible(self) -> Tensor:
+        """int32 [N], as `GpuRendering.visible`."""
+        return self.own.visible
 
 
 @dataclass(frozen=True)
@@ -98,7 +108,7 @@ class GpuRendering:
     """float32 [N], if asked for: sum over pixels of transmittance * alpha"""
     invalid_count: int
     """Gaussians skipped because an attribute is not finite or absurd, or the quaternion is zero"""
-    _kept: _Kept = field(repr=False)
+    _kept: OnGpu = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,7 @@ def compose(
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     check(gaussians, degree)
     listed = _listed(_uploaded(gaussians), degree, view, active, camera.height)
-    return GpuLayer(view, active, _shown(listed), listed.invalid_count)
+    return GpuLayer(view, active, _shown(listed), int(listed.invalid))
 
 
 def forward(
@@ -146,21 +156,44 @@ def forward(
     """Arguments and errors as in `cpu.forward`."""
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     check(gaussians, degree)
-    view = view_constants(camera, options.near, options.low_pass_px2)
-    active = checked_tiles(tiles, camera) if over is None else over.tiles_to_draw(tiles, weights, camera, options)
-    fields = _uploaded(gaussians)
-    own = _listed(fields, degree, view, active, camera.height)
-    drawn = _sorted(own.pairs if over is None else _joined(over.pairs, own.pairs, active), active.size)
-    shares = torch.zeros(len(own.pairs.keys) if weights else 1, device=MEMORY)
-    pictures = _blended(drawn, camera, on_device(np.asarray(background, np.float32)), weights, shares)
+    drawn = draw(
+        _uploaded(gaussians),
+        camera,
+        options=options,
+        sh_degree=degree,
+        background=background,
+        tiles=tiles,
+        weights=weights,
+        over=over,
+    )
     sums = None
     if weights:
         sums = torch.zeros(len(gaussians), device=MEMORY)
-        run_rows(project.sum_shares, len(sums), shares, own.first_pair, sums)
-    kept = _Kept(fields, on_device(view), degree, own, drawn, pictures)
-    colour, depth, alpha = map(_array, pictures)
+        run_rows(project.sum_shares, len(sums), drawn.shares, drawn.own.first_pair, sums)
+    colour, depth, alpha = map(_array, drawn.pictures)
     shown = None if sums is None else _array(sums)
-    return GpuRendering(colour, depth, alpha, _array(own.visible), shown, own.invalid_count, kept)
+    return GpuRendering(colour, depth, alpha, _array(drawn.visible), shown, int(drawn.own.invalid), drawn)
+
+
+def draw(
+    fields: tuple[Tensor, ...],
+    camera: PinholeCamera,
+    *,
+    options: RasterOptions,
+    sh_degree: int,
+    background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    tiles: np.ndarray | None = None,
+    weights: bool = False,
+    over: GpuLayer | None = None,
+) -> OnGpu:
+    """As `forward`, of Gaussians on the GPU, in the order of `ATTRIBUTES`."""
+    view = view_constants(camera, options.near, options.low_pass_px2)
+    active = checked_tiles(tiles, camera) if over is None else over.tiles_to_draw(tiles, weights, camera, options)
+    own = _listed(fields, sh_degree, view, active, camera.height)
+    drawn = _sorted(own.pairs if over is None else _joined(over.pairs, own.pairs, active), active.size)
+    shares = torch.zeros(len(own.pairs.keys) if weights else 1, device=MEMORY)
+    pictures = _blended(drawn, camera, on_device(np.asarray(background, np.float32)), weights, shares)
+    return OnGpu(fields, on_device(view), sh_degree, own, drawn, pictures, shares)
 
 
 def backward(
@@ -173,10 +206,19 @@ def backward(
 ) -> Gradients:
     """Arguments and errors as in `cpu.backward`."""
     kept = rendering._kept
-    own, fields = kept.own, kept.fields
-    count, pair_count = len(own.visible), len(own.pairs.keys)
+    count = len(kept.visible)
     chosen = on_device(np.ones(count, np.uint8) if rows is None else checked_rows(rows, count))
     slopes = [_slope(d, p) for d, p in zip((d_colour, d_depth, d_alpha), kept.pictures, strict=True)]
+    out, overflown = carry(kept, slopes, chosen)
+    means, log_scales, quaternions, logits, sh, screen = map(_array, out)
+    return Gradients(means, log_scales, quaternions, logits, sh, screen, int(overflown))
+
+
+def carry(kept: OnGpu, slopes: Sequence[Tensor], chosen: Tensor) -> tuple[list[Tensor], Tensor]:
+    """Gradients by the Gaussians, in the order of `ATTRIBUTES`, and by their centres in the picture, [N, 2]; and how
+    many rows were set to zero, int32 [1]. `slopes` by colour, depth and alpha; `chosen` uint8 [N]."""
+    own, fields = kept.own, kept.fields
+    count, pair_count = len(own.visible), len(own.pairs.keys)
     partial = torch.empty((pair_count, project.SUMS), device=MEMORY)
     used = torch.zeros(pair_count, dtype=torch.uint8, device=MEMORY)
     _blend_backward(kept, slopes, chosen, partial, used)
@@ -184,8 +226,7 @@ def backward(
     overflown = torch.zeros(1, dtype=torch.int32, device=MEMORY)
     given = *fields, kept.sh_degree, kept.view, own.pairs.record, chosen, own.first_pair, used, partial
     run_rows(project.project_backward, count, *given, *out, overflown)
-    means, log_scales, quaternions, logits, sh, screen = map(_array, out)
-    return Gradients(means, log_scales, quaternions, logits, sh, screen, int(overflown))
+    return out, overflown
 
 
 def _listed(fields: tuple[Tensor, ...], degree: int, view: np.ndarray, active: np.ndarray, height: int) -> _Listed:
@@ -204,7 +245,7 @@ def _listed(fields: tuple[Tensor, ...], degree: int, view: np.ndarray, active: n
     keys, gaussians, masks = torch.empty(pairs, dtype=torch.int64, device=MEMORY), _integers(pairs), _integers(pairs)
     depth_bits = record[:, DEPTH].contiguous().view(torch.int32)
     run_rows(project.list_tiles, count, record, box, depth_bits, tiles, height, first_pair, keys, gaussians, masks)
-    return _Listed(Pairs(record, keys, gaussians, masks), hits, first_pair, int(invalid))
+    return _Listed(Pairs(record, keys, gaussians, masks), hits, first_pair, invalid)
 
 
 def _shown(listed: _Listed) -> Pairs:
@@ -246,7 +287,7 @@ def _blended(
     return colour, depth, alpha
 
 
-def _blend_backward(kept: _Kept, slopes: Sequence[Tensor], chosen: Tensor, partial: Tensor, used: Tensor) -> None:
+def _blend_backward(kept: OnGpu, slopes: Sequence[Tensor], chosen: Tensor, partial: Tensor, used: Tensor) -> None:
     """Partial gradients of a rendering's own Gaussians; a layer's, which come before them, are not chosen."""
     drawn, own = kept.drawn, kept.own.pairs
     still = len(drawn.pairs.record) - len(own.record)

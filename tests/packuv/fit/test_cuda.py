@@ -15,7 +15,7 @@ from packuv.fit.losses import PhotometricOptions, photometric_loss
 from packuv.fit.model import Model
 from packuv.fit.options import FitOptions
 from packuv.fit.shots import Shot
-from packuv.fit.solver import Solver
+from packuv.fit.solver import open_solver
 from packuv.fit.start.bounds import Bounds
 from packuv.raster import render
 from tests.support.dense_raster import OPTIONS, camera, scene
@@ -74,7 +74,8 @@ def test_the_made_up_scene_and_a_fit_are_the_cpus():
     losses = []
     for device in ("cpu", "cuda"):
         options = FitOptions(device=device)
-        solver = Solver(Model(scene(60, degree=0)), Bounds(np.zeros(3), 2.0, 0.05), options, np.random.default_rng(0))
+        bounds = Bounds(np.zeros(3), 2.0, 0.05)
+        solver = open_solver(Model(scene(60, degree=0)), bounds, options, np.random.default_rng(0))
         losses.append([solver.run(shots, 4, of=12)["photometric"] for _ in range(3)])
     assert losses[1] == pytest.approx(losses[0], rel=1e-3)
     assert losses[1][-1] < 0.9 * losses[1][0]

@@ -16,7 +16,7 @@ import torch
 from packuv.camera import PinholeCamera
 from packuv.fit import device
 from packuv.fit.backdrop import Backdrop, joined
-from packuv.fit.device import choose_device, drawn_differently, obstacle
+from packuv.fit.device import choose_device, drawn_differently, gpu_is_full, obstacle
 from packuv.gaussians.floats import Gaussians, rows_of
 from packuv.raster import render
 from tests.support.dense_raster import OPTIONS, camera, scene
@@ -24,15 +24,16 @@ from tests.support.places import ROOT
 
 
 @pytest.mark.slow
-def test_the_cuda_kernels_do_what_the_cpus_do_in_the_simulator():
+@pytest.mark.parametrize("tests", ["raster/test_cuda.py", "fit/test_cuda.py", "fit/test_rows_cuda.py",
+                                   "fit/test_resident.py"])  # fmt: skip
+def test_the_cuda_kernels_do_what_the_cpus_do_in_the_simulator(tests):
     """In an interpreter of its own, since numba reads the switch when it is imported."""
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": str(ROOT)}
-    tests = ["tests/packuv/raster/test_cuda.py", "tests/packuv/fit/test_cuda.py"]
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *tests]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", f"tests/packuv/{tests}"]
     environment.pop("PACKUV_REQUIRE", None)
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert " passed, 1 skipped" in done.stdout
+    assert (" passed, 1 skipped" if tests == "fit/test_cuda.py" else " passed in ") in done.stdout
 
 
 def erring(change):
@@ -83,6 +84,13 @@ def test_a_backdrop_has_layers():
     assert np.abs(drawn.colour - plain.colour).max() < 2e-4
     nothing = rows_of(scene(4), slice(0, 0))
     assert Backdrop(nothing, OPTIONS.near).layer(camera(), None) is None
+
+
+def test_used_up_memory_is_told_from_other_errors():
+    assert gpu_is_full(torch.OutOfMemoryError("CUDA out of memory."))
+    assert gpu_is_full(RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY"))
+    assert not gpu_is_full(RuntimeError("[700] Call to cuCtxSynchronize results in CUDA_ERROR_ILLEGAL_ADDRESS"))
+    assert not gpu_is_full(MemoryError())
 
 
 def test_without_numba_cuda_the_cpu_does_everything(monkeypatch):

@@ -36,8 +36,14 @@ def compiled(kernel, blocks, *given):
 launch.MEMORY, launch.run = torch.device("cpu"), compiled
 launch.run_rows = lambda kernel, count, *given: compiled(kernel, count, *given)
 
+from packuv.fit import rows_cuda
+from packuv.fit.keyframe import choose_quantizer
 from packuv.fit.labels import LabelOptions, count_hits
 from packuv.fit.losses import PhotometricOptions, photometric_loss
+from packuv.fit.model import Model, Rates
+from packuv.fit.shots import Shot
+from packuv.fit.shots_cuda import ShotOnGpu
+from packuv.fit.start.bounds import Bounds
 from packuv.raster.cuda import render
 from tests.support.dense_raster import camera, scene, upstream
 
@@ -46,9 +52,16 @@ render.backward(rendering, *upstream(camera()))
 masks = [np.ones((50, 70), bool)]
 count_hits(scene(5), [camera()], masks, near=0.05, options=LabelOptions(), device="cuda")
 photometric_loss(*np.zeros((2, 3, 9, 9), np.float32), options=PhotometricOptions(), device="cuda")
+model, bounds = Model(scene(5)), Bounds(np.zeros(3), 2.0, 0.05)
+rows = rows_cuda.RowsOnGpu(model, np.ones(5, bool), choose_quantizer(model.gaussians, bounds, 3))
+rates = rows_cuda.rates_of(Rates(), model.gaussians, radius=1.0, progress=0.0)
+rows.step(rows.masters, rates, rows.rows, 1)
+held = ShotOnGpu(Shot(camera(), np.zeros((3, 50, 70), np.float32)))
+held.carried(held.shown(held.target))
 """
-DOUBLE = {"project", "project_backward", "vote_all"}
+DOUBLE = {"project", "project_backward", "vote_all", "_code"}
 SINGLE = {"count_tiles", "list_tiles", "blend", "sum_shares", "blend_backward", "_compare", "_slopes"}
+SINGLE |= {"_advance", "_guard", "_show", "_carry"}
 
 
 def compiler() -> bool:

@@ -589,6 +589,27 @@ def test_damage_to_the_header_is_named(scene_file, tmp_path):
         open_scene(damaged(scene_file, tmp_path, without_copy(content)))
 
 
+def test_whose_header_or_copy_is_damaged_is_told_and_costs_no_frame(scene_file, tmp_path):
+    content = scene_file[0].read_bytes()
+    at = len(without_copy(content))
+    first = content[:at].replace(b'"rate":"30000/1001"', b'"rate":"30000/1002"') + content[at:]
+    structure = content[:3] + bytes([content[3] ^ 8]) + content[4:]
+    second = content[: at + 40] + bytes([content[at + 40] ^ 8]) + content[at + 41 :]
+    told = (
+        r"packuv\.json is damaged.*the second copy was read",
+        "the second copy was read",
+        "second copy of its header",
+    )
+    for changed, words in zip((first, structure, second), told, strict=True):
+        path = damaged(scene_file, tmp_path, changed)
+        report = verify_scene(path, threads=1)
+        assert not report.ok
+        assert not report.bad
+        assert re.search(words, report.header)
+        assert str(path) in report.header
+        assert report.problem == report.header
+
+
 def test_no_damaged_byte_outside_of_packets_costs_anything(scene_file, tmp_path):
     """Of the file's structure, the header, its checksum, and the copy of it."""
     path, frames = scene_file

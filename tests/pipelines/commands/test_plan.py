@@ -123,9 +123,30 @@ def cut_short(folder: Path) -> Path:
     return folder
 
 
+def with_lenses(folder: Path, *names: str) -> Path:
+    """A capture of which lenses are known, and no poses."""
+    (still(folder) / "calibration").mkdir()
+    lens = "!!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]\n"
+    text = "%YAML:1.0\n---\nnames:\n" + "".join(f'  - "{name}"\n' for name in names)
+    (folder / "calibration" / "intri.yml").write_text(text + "".join(f"K_{name}: {lens}" for name in names))
+    return folder
+
+
+def one_without_a_lens(folder: Path) -> Path:
+    return with_lenses(folder, "cam1", "cam2")
+
+
+def a_strange_calibration(folder: Path) -> Path:
+    (still(folder) / "calibration").mkdir()
+    (folder / "calibration" / "transforms.json").write_text('{"frames": []}')
+    return folder
+
+
 @pytest.mark.parametrize(
     ("capture", "more", "message"),
     [
+        (one_without_a_lens, [], "videos without one: cam3"),
+        (a_strange_calibration, [], "transforms.json"),
         (still, ["--clock", "content"], "do not tell when cam1, cam2, cam3 began to film"),
         (cut_short, [], "19 timecodes"),
         (still, ["--frames", "50:60"], "the capture has instants 0 to 19"),
@@ -141,6 +162,26 @@ def test_a_plan_refuses_what_its_run_refuses(tmp_path, capsys, capture, more, me
             assert not (tmp_path / "out").exists(), "a plan leaves nothing where nothing was"
     assert told[0] == told[1]
     assert message in told[0]
+
+
+def test_a_rig_that_is_to_be_solved_is_forecast_and_told(tmp_path, capsys):
+    def plan(capture: Path) -> tuple[float, list[str]]:
+        out = tmp_path / f"of {capture.name}"
+        out.mkdir()
+        assert main(["plan", str(capture), "--out", str(out), "--stop-after", "calibrate", *SETS, "--json"]) == OK
+        found = json.loads(capsys.readouterr().out)
+        (minutes,) = (step["minutes"] for step in found["stages"] if step["stage"] == "calibrate")
+        return minutes, [*found["not_in_the_forecast"], *(item["what"] for item in found["spared"])]
+
+    given = shutil.copytree(CAPTURE, tmp_path / "given")
+    bare = shutil.copytree(CAPTURE, tmp_path / "bare")
+    shutil.rmtree(bare / "calibration")
+    known = with_lenses(tmp_path / "known", "cam1", "cam2", "cam3")
+    (least, told), (more, told_more), (_, told_lenses) = map(plan, (given, bare, known))
+    assert least < more
+    assert "solving the cameras" in told
+    assert any("cameras have to be solved by COLMAP" in text for text in told_more)
+    assert any("of which the lenses alone are known, have to be solved by COLMAP" in text for text in told_lenses)
 
 
 def test_a_sequence_that_its_run_would_refuse_does_not_stop_the_plan_of_the_others(tmp_path, capsys):

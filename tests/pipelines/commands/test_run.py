@@ -227,25 +227,41 @@ def test_masks_that_come_later_redo_what_they_are_used_for_and_doubtful_ones_not
     assert 0 < scores["foreground_share"] < 0.5
     assert scores["psnr_foreground_db"] > 5
 
+    afresh = tmp_path / "afresh"
+    assert main(["run", str(capture), *words(afresh, "--direct")[5:]]) == OK
+    assert made_in(afresh) == masked
+    assert next(afresh.glob("*/scene.mkv")).read_bytes() == next(out.glob("*/scene.mkv")).read_bytes()
+
     shutil.rmtree(capture / "masks")
     assert main(asked) == OK
     assert made_in(out) == plain
     assert next(out.glob("*/scene.mkv")).read_bytes() == scene
 
 
-def test_masks_that_do_not_fit_their_camera_end_a_run_before_any_work(tmp_path, capsys):
-    capture = shutil.copytree(CAPTURE, tmp_path / "capture")
-    picture = np.zeros((4, 4), np.uint8)
-    masks = capture / "masks" / "cam03"  # which is held out
-    masks.mkdir(parents=True)
-    cv2.imwrite(str(masks / "000000.png"), picture)
-    out = tmp_path / "out"
-    asked = ["run", str(capture), "--out", str(out), "--preset", "draft", "--hold-out", "cam03", "--direct"]
+def test_masks_that_do_not_fit_end_plan_and_run_before_any_work(tmp_path, capsys):
+    capture, out = shutil.copytree(CAPTURE, tmp_path / "capture"), tmp_path / "out"
+    asked = [str(capture), "--out", str(out), "--preset", "draft", "--hold-out", "cam03"]
+    run, plan = ["run", *asked, "--direct"], ["plan", *asked]
 
-    assert main(asked) == WRONG
-    assert "cam03 must have a mask for each of the" in capsys.readouterr().err
-    (made,) = out.iterdir()
-    assert [path.name for path in (made / "store").iterdir() if path.is_dir() and path.name[0] != "."] == ["sync"]
-    masks.rename(masks.with_name("cam33"))
-    assert main(asked) == WRONG
-    assert "cam33 belongs to no video; did you mean 'cam03'?" in capsys.readouterr().err
+    def refused(told: str, *made: str) -> None:
+        for words in (plan, run, plan):  # the last of which meets what the run left
+            assert main(words) == WRONG
+            assert told in capsys.readouterr().err
+            stores = out.glob("*/store/[!.]*")
+            assert {path.name for path in stores if path.is_dir() and any(path.glob("[!.]*/receipt.json"))} == {*made}
+
+    write_masks(capture, "cam02", "cam03")  # the second of which is held out
+    last = max((capture / "masks" / "cam03").iterdir())
+    whole = last.read_bytes()
+    last.unlink()
+    refused("cam03 must have a mask for each of the")
+    last.write_bytes(whole[:-20])
+    refused(f"cam03: {last.name} is damaged: it is cut short")
+    cv2.imwrite(str(last), np.zeros((4, 4), np.uint8))
+    refused(f"but {last.name} is 4x4")
+    last.write_bytes(whole)
+    assert main([*run, "--stop-after", "sync"]) == OK
+    last.write_bytes(whole[:-20])
+    refused(f"cam03: {last.name} is damaged: it is cut short", "mask_files", "sync")
+    last.parent.rename(last.parent.with_name("cam33"))
+    refused("cam33 belongs to no video; did you mean 'cam03'?", "mask_files", "sync")

@@ -146,14 +146,23 @@ def overwrite_and_hide(lab: Lab) -> None:
     os.utime(lab.video, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
+def add_masks(lab: Lab, camera: str) -> None:
+    """A folder that is there at once, with a mask in it."""
+    made = lab.folder / "made" / camera
+    made.mkdir(parents=True)
+    (made / "000000.png").write_bytes(b"a mask")
+    made.parent.rename(lab.folder / "capture" / "masks")
+
+
 CHANGES = [
     (lambda lab: lab.replace_video(WRONG), r"cam01\.mp4 has another content than when this run began; put back"),
     (overwrite_and_hide, r"cam01\.mp4 has another content than when this run began"),
     (lambda lab: lab.video.unlink(), r"cam01\.mp4 has gone since this run began"),
     (lambda lab: (lab.video.parent / "cam03.mp4").touch(), r"cam03\.mp4 was added since this run began"),
+    (lambda lab: add_masks(lab, "cam01"), r"masks/cam01 was added since this run began"),
     (lambda lab: lab.edit("fps = 25"), r"capture\.toml .* than when this run began; put back what was there, or run"),
 ]
-IDS = ["replaced", "overwritten", "removed", "added", "settings"]
+IDS = ["replaced", "overwritten", "removed", "added", "masks", "settings"]
 
 
 @pytest.mark.parametrize(("change", "message"), CHANGES, ids=IDS)

@@ -7,9 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
 
+from packuv.fit.options import FitOptions
+from packuv.progress import no_progress
 from tasks.artefacts.jobs import JobDiedError, JobError
-from tasks.artefacts.stage import Needs, Site, Stage
+from tasks.artefacts.recipe import plain, restore
+from tasks.artefacts.stage import Needs, Site, Stage, StageJob
 from tasks.artefacts.store import Store
 from tasks.cluster.orders import Seen, fulfil, offered, order, read, resources
 from tests.support.naps import Nap
@@ -23,7 +27,7 @@ class Options:
 @dataclass(frozen=True, kw_only=True)
 class Fit(Stage):
     name, version = "fit", 1
-    options: Options
+    options: Options | FitOptions
 
     def build(self, work):
         return {}
@@ -125,3 +129,53 @@ def test_a_stage_says_what_it_needs(site):
     assert on_gpu.fits(Needs(4, 3_000_000_000, 1))
     for small in (Needs(2, 9_000_000_000, 1), Needs(4, 2_000_000_000, 1), Needs(4, 9_000_000_000)):
         assert not on_gpu.fits(small)
+
+
+def test_a_gpu_names_no_artefact_but_its_receipt_says_so(site):
+    """A run that loses its GPU goes on with what is there."""
+    cpu, cuda = (Fit(options=FitOptions(device=device)) for device in ("cpu", "cuda"))
+    store = Store(site.store)
+    assert store.key("fit", 1, cpu.settings, {}) == store.key("fit", 1, cuda.settings, {})
+    assert store.key("fit", 1, cpu.settings, {}) != store.key("fit", 1, {"options": FitOptions(seed=1)}, {})
+    notes = [StageJob(stage, site, Path("out"), Path("scratch"))(no_progress) for stage in (cpu, cuda)]
+    assert notes == [{}, {"device": "cuda"}]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Large(Fit):
+    """Needs more memory than the GPU has."""
+
+    text: str = "CUDA out of memory. Tried to allocate 9 GiB.\nSee the manual"
+
+    def build(self, work):
+        device = self.options.device
+        (work.out / device).write_text("here")
+        if device == "cuda":
+            raise torch.OutOfMemoryError(self.text)
+        return {"made": sorted(path.name for path in work.out.iterdir())}
+
+
+def test_where_the_gpus_memory_is_used_up_the_cpu_goes_on_and_it_is_told(site, tmp_path):
+    out = tmp_path / "out"
+    (out / "part").mkdir(parents=True)
+    notes = StageJob(Large(options=FitOptions(device="cuda")), site, out, tmp_path)(no_progress)
+    assert (notes["made"], notes["device"]) == (["cpu"], "cpu")
+    assert notes["no_gpu"] == (
+        "its memory was used up (CUDA out of memory. Tried to allocate 9 GiB.), so the CPU did it"
+    )
+
+
+def test_other_errors_on_a_gpu_are_raised(site, tmp_path):
+    with pytest.raises(RuntimeError, match="drawn otherwise"):
+        StageJob(Broken(options=Options("cuda")), site, tmp_path, tmp_path)(no_progress)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Broken(Fit):
+    def build(self, work):
+        raise RuntimeError("drawn otherwise")
+
+
+def test_the_device_still_travels_with_an_order():
+    assert plain(FitOptions(device="cuda"))["device"] == "cuda"
+    assert restore(FitOptions, plain(FitOptions(device="cuda"))) == FitOptions(device="cuda")

@@ -387,7 +387,8 @@ def test_nine_gains_are_one_line_with_each_as_evidence() -> None:
     cameras = tuple(replace(c, gains=(gain, 1.0, 1.0)) for c, gain in zip(rig.cameras, gains, strict=True))
     (finding,) = findings(replace(make_report(), rig=replace(rig, cameras=cameras)))
     assert finding.text == (
-        "9 cameras need a colour gain beyond 1.25 or 1/1.25: cam0, cam1, cam2, cam3, cam4, cam5 and 3 more."
+        "9 cameras need a colour gain beyond 1.25 or 1/1.25: cam0 (1.30), cam1 (1.40), cam2 (1.50), cam3 (1.60), "
+        "cam4 (1.70), cam5 (1.80) and 3 more."
     )
     assert [f"cam{index} needs a colour gain of {gain:.2f}." for index, gain in enumerate(gains)] == list(
         finding.evidence

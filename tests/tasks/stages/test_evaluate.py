@@ -111,6 +111,13 @@ def test_the_content_of_the_weights_decides_what_is_scored_anew_not_their_place(
     assert recipe(no_lpips="no file") == recipe(no_lpips="no package")
 
 
+def test_who_draws_takes_a_gpu_but_does_not_decide():
+    take = Take(groups=Key("sync", "0" * 64), cameras=("cam05",))
+    cpu, cuda = (Evaluate(take=take, scene=Key("encode", "0" * 64), device=device) for device in ("cpu", "cuda"))
+    assert (cpu.sources, cpu.settings) == (cuda.sources, cuda.settings)
+    assert (cpu.on_gpu, cuda.on_gpu) == (False, True)
+
+
 @given(st.lists(st.text(min_size=1, max_size=3), unique=True, max_size=40), st.integers(1, 8))
 def test_spread_takes_distinct_names_in_order(names, count):
     chosen = spread(names, count)
