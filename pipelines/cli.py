@@ -222,6 +222,7 @@ def parser(found: Iterable[EntryPoint] | None = None) -> argparse.ArgumentParser
     _atlas(command("atlas", "pipelines.commands.exchange:atlas", "write the UV atlas of a frame as a picture"))
     _web(command("web", "pipelines.commands.exchange:web", "write a scene as static files for any web server"))
     _render(command("render", "pipelines.commands.scenes:render", "write pictures of a scene as PNG files"))
+    _film(command("film", "pipelines.commands.scenes:film", "write an MP4 of a scene along a camera path"))
     _evaluate(command("eval", "pipelines.commands.scenes:evaluate", "score a scene against a capture"))
     _serve(command("serve", "pipelines.commands.serve:serve", "keep a dashboard, and run by form, script or schedule"))
     _worker(command("worker", "pipelines.commands.worker:worker", "make stages here for runs with --cluster"))
@@ -554,6 +555,15 @@ def _render(command: argparse.ArgumentParser) -> None:
     command.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for 000000.png, ...")
 
 
+def _film(command: argparse.ArgumentParser) -> None:
+    _scene(command)
+    command.add_argument("path", type=Path, metavar="PATH.json", help="a camera path, as the viewer writes it")
+    command.add_argument("--size", type=_size, default=None, metavar="WxH", help="picture size, pixels (first view's)")
+    command.add_argument("--fps", type=_rate, default=None, metavar="N", help="pictures per second (the scene's)")
+    command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
+    _output(command, "FILE.mp4", "the film")
+
+
 def _evaluate(command: argparse.ArgumentParser) -> None:
     _scene(command)
     command.add_argument("capture", type=Path, metavar="CAPTURE", help="the capture folder it was made from")
@@ -584,6 +594,9 @@ def _report(command: argparse.ArgumentParser) -> None:
 def _view(command: argparse.ArgumentParser) -> None:
     _scene(command)
     command.add_argument("--port", type=int, default=8787, help="TCP port; 0 picks a free one")
+    command.add_argument(
+        "--capture", type=Path, metavar="DIR", help="lay what its cameras filmed beside (the run's, where it is known)"
+    )
     command.add_argument("--host", default="127.0.0.1", help="address to answer at; 0.0.0.0 shows it to everyone")
 
 

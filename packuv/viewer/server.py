@@ -21,8 +21,21 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
-from packuv.viewer.source import Source, describe, frame_bytes, key_bytes, open_source, tables_bytes
+import cv2
+
+from packuv.gaussians.uvsize import UvOptions
+from packuv.viewer.source import (
+    Source,
+    Truth,
+    describe,
+    frame_bytes,
+    key_bytes,
+    layer_bytes,
+    open_source,
+    tables_bytes,
+)
 
 PAGES = {
     "/": ("page.html", "text/html; charset=utf-8"),
@@ -34,7 +47,8 @@ PAGES = {
 """Path to file beside this module and its type; nothing else on disk is reachable"""
 
 BINARY = "application/octet-stream"
-NUMBERED = re.compile(r"/(segments|frames)/(0|[1-9][0-9]{0,8})\.bin")
+PICTURE = re.compile(r"/truth/([^/]{1,600})/(0|[1-9][0-9]{0,8})\.png")
+NUMBERED = re.compile(r"/(segments|frames|layers)/(0|[1-9][0-9]{0,8})\.bin")
 
 POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """Content security policy: a page that tries to reach another origin fails at once"""
@@ -55,16 +69,17 @@ def serve(
     open_browser: bool = False,
     announce: Callable[[str], object] | None = None,
     worst: int | None = None,
+    truth: Truth | None = None,
 ) -> None:
     """Show a scene file in the browser until interrupted.
 
     Port 0 takes any free port. `announce` gets the address once it answers; by default it is printed. `worst` is a
-    frame to mark as the one with the lowest score. Raises FileNotFoundError for a missing file, ValueError for one
-    that is no scene, or where the port or the host cannot be had.
+    frame to mark as the one with the lowest score, `truth` what to lay beside. Raises FileNotFoundError for a missing
+    file, ValueError for one that is no scene, or where the port or the host cannot be had.
     """
     if not 0 <= port < 2**16:
         raise ValueError(f"a port is a number from 0 to {2**16 - 1}, but is {port}")
-    with open_source(scene_path) as source, _server(host, port, source, worst) as server:
+    with open_source(scene_path) as source, _server(host, port, source, worst, truth) as server:
         announce(server.url) if announce else print(server.url, flush=True)
         if open_browser:
             webbrowser.open(server.url)
@@ -72,9 +87,9 @@ def serve(
             server.serve_forever()
 
 
-def _server(host: str, port: int, source: Source, worst: int | None) -> ViewerServer:
+def _server(host: str, port: int, source: Source, worst: int | None, truth: Truth | None) -> ViewerServer:
     try:
-        return ViewerServer((host, port), source, worst=worst)
+        return ViewerServer((host, port), source, worst=worst, truth=truth)
     except OSError as error:
         why, cure = error.strerror or str(error), "name another --port, or 0 for a free one"
         if error.errno not in (errno.EADDRINUSE, errno.EACCES):
@@ -88,9 +103,11 @@ class ViewerServer(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = MOST_CONNECTIONS
 
-    def __init__(self, address: tuple[str, int], source: Source, *, worst: int | None = None) -> None:
+    def __init__(
+        self, address: tuple[str, int], source: Source, *, worst: int | None = None, truth: Truth | None = None
+    ) -> None:
         super().__init__(address, _Handler)
-        self.source, self.worst = source, worst
+        self.source, self.worst, self.truth = source, worst, truth
         self.reading = threading.Lock()  # decoders keep state
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.tables = lru_cache(maxsize=1)(lambda: tables_bytes(source.quantizer))
@@ -129,14 +146,27 @@ class ViewerServer(ThreadingHTTPServer):
             return Path(__file__).with_name(name).read_bytes(), kind
         if path == "/scene.json":
             marked = {} if self.worst is None else {"worst": self.worst}
-            return json.dumps({**describe(self.source), **marked}).encode(), "application/json"
+            filmed = {"truth": list(self.truth.cameras)} if self.truth else {}
+            told = {**describe(self.source), **marked, **filmed, "layers": UvOptions.layers}
+            return json.dumps(told).encode(), "application/json"
         if path == "/tables.bin":
             return self.tables(), BINARY
+        if asked := PICTURE.fullmatch(path):
+            return self._filmed(unquote(asked[1]), int(asked[2]))
         numbered = NUMBERED.fullmatch(path)
         return self._numbered(numbered[1], int(numbered[2])) if numbered else None
 
+    def _filmed(self, camera: str, frame: int) -> tuple[bytes, str] | None:
+        if not self.truth or camera not in self.truth.cameras or frame >= self.source.segments[-1].stop:
+            return None
+        pixels = self.truth.picture(camera, frame)
+        if pixels is None:
+            return None
+        written = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        return written.tobytes(), "image/png"
+
     def _numbered(self, what: str, number: int) -> tuple[bytes, str] | None:
-        build = key_bytes if what == "segments" else frame_bytes
+        build = {"segments": key_bytes, "frames": frame_bytes, "layers": layer_bytes}[what]
         try:
             with self.reading:
                 return build(self.source, number), BINARY

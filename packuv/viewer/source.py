@@ -21,8 +21,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.gaussians.codes import Codes, Quantizer, attribute_count
+from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
+from packuv.gaussians.uvmap import assign_slots
+from packuv.gaussians.uvsize import UvOptions
 from packuv.scene import Scene, open_scene
 
 NEAR_SHARE = 0.02
@@ -88,6 +90,16 @@ class Source(Protocol):
 
     def moving(self, frame: int) -> Codes:
         """The D dynamic rows of a frame."""
+
+
+class Truth(Protocol):
+    """What cameras filmed, to lay beside a scene; any thread asks."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]: ...
+
+    def picture(self, camera: str, frame: int) -> np.ndarray | None:
+        """uint8 [H, W, 3], RGB: undistorted, in the scene's colours and the light of the frame; None without one."""
 
 
 @dataclass(frozen=True)
@@ -247,6 +259,20 @@ def key_bytes(source: Source, segment: int) -> bytes:
     codes, dynamic = source.key(segment), source.dynamic(segment)
     head = _head(len(codes), int(dynamic.sum()), codes)
     return head + _planes(codes.xyz, codes.attributes) + dynamic.astype(np.uint8).tobytes()
+
+
+def layer_bytes(source: Source, segment: int) -> bytes:
+    """Layer of the UV map, from 1 on, that takes each of the N rows of a keyframe, uint8; 0 where none does, or the row
+    is absent there. As in the atlas of `packuv atlas` with its default size."""
+    if not 0 <= segment < len(source.segments):
+        raise IndexError(f"segment {segment} of a scene with {len(source.segments)}")
+    codes = source.key(segment)
+    shown = np.flatnonzero(codes.attributes[:, OPACITY] > 0)
+    points = source.quantizer.decode(codes[shown]).means
+    slots = assign_slots(points, codes.attributes[shown, OPACITY], source.quantizer.centre, options=UvOptions())
+    layers = np.zeros(len(codes), np.uint8)
+    layers[shown] = slots.layer + 1
+    return layers.tobytes()
 
 
 def frame_bytes(source: Source, frame: int) -> bytes:

@@ -4,7 +4,7 @@
 
 const WIDTH = 1024; // slots per texture row, as in worker.js
 const BATCH = 2048; // quads per instance: one quad each would leave most of a GPU idle
-export const MODES = ["colour", "depth", "dynamic", "opacity", "map"];
+export const MODES = ["colour", "depth", "dynamic", "opacity", "map", "layer"];
 export const DEPTH_STOPS = [ // near to far, of even steps in lightness
   [253, 231, 37], [122, 209, 81], [34, 168, 132], [42, 120, 142], [65, 68, 135], [46, 16, 62],
 ];
@@ -16,6 +16,7 @@ const PROJECT = `#version 300 es
 precision highp float;
 precision highp int;
 uniform highp usampler2DArray codes;
+uniform highp usampler2D atlas; // layer of the UV map, 0 where none takes the Gaussian
 uniform highp sampler2D tables; // rows of 256: 3 x 256 rows of positions, then a row per attribute
 uniform mat3 cameraFromWorld;
 uniform vec3 eye;
@@ -112,6 +113,11 @@ void main() {
   }
   if (mode == 3) rgb = vec3(alpha);
   if (mode == 4) rgb = mapped(world - centre);
+  if (mode == 5) {
+    uint seat = texelFetch(atlas, at, 0).r;
+    float t = clamp(float(seat) - 1.0, 0.0, 7.0) / 7.0;
+    rgb = seat == 0u ? vec3(1.0, 0.0, 1.0) : mix(vec3(0.95, 0.95, 0.85), vec3(0.05, 0.15, 0.6), t);
+  }
   shape = floatBitsToUint(vec4(lens.xy * ratio + lens.zw, longer * axis));
   uint blueAlpha = packHalf2x16(vec2(rgb.z, alpha));
   look = uvec4(floatBitsToUint(shorter), packHalf2x16(rgb.xy), blueAlpha, floatBitsToUint(local.z));
@@ -255,6 +261,15 @@ export class SplatView {
     this.upload(packed, rows);
   }
 
+  // Layer of the UV map of each slot, uint8.
+  setLayers(layers) {
+    const { gl } = this;
+    if (layers.length !== WIDTH * this.slotRows) return; // of a segment that is gone
+    bind(gl, 0, gl.TEXTURE_2D, this.atlas);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.slotRows, gl.RED_INTEGER, gl.UNSIGNED_BYTE, layers);
+  }
+
   // The dynamic Gaussians of a frame, which fill the first `rows` texture rows.
   setFrame(packed, rows) {
     if (rows) this.upload(packed, rows);
@@ -358,6 +373,8 @@ export class SplatView {
     bind(gl, 1, gl.TEXTURE_2D, this.tables);
     gl.uniform1i(uniforms.codes, 0);
     gl.uniform1i(uniforms.tables, 1);
+    bind(gl, 2, gl.TEXTURE_2D, this.atlas);
+    gl.uniform1i(uniforms.atlas, 2);
     this.setView(uniforms, view);
     gl.uniform1f(uniforms.scale, look.scale);
     gl.uniform1i(uniforms.layers, this.layers);
@@ -408,9 +425,11 @@ export class SplatView {
   allocate(rows) {
     const { gl } = this;
     this.slotRows = rows;
-    for (const old of [this.codes, this.order, this.shapes, this.looks]) gl.deleteTexture(old);
+    for (const old of [this.codes, this.order, this.shapes, this.looks, this.atlas]) gl.deleteTexture(old);
     this.codes = texture(gl, gl.TEXTURE_2D_ARRAY);
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA32UI, WIDTH, rows, this.layers);
+    this.atlas = texture(gl, gl.TEXTURE_2D);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R8UI, WIDTH, rows);
     this.order = texture(gl, gl.TEXTURE_2D);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, WIDTH, rows);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projected);

@@ -3,6 +3,7 @@
 import { DEPTH_STOPS, MODES, SplatView } from "./splats.js";
 import { Navigation, frusta, worldOf } from "./navigation.js";
 
+const VIEW_SECONDS = 2; // of a camera path, from view to view at least
 const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
 const STALL_NOTICE_MS = 250;
 const HERE = 1, LOST = 2; // what the worker says of a frame; 0 is on its way
@@ -18,6 +19,10 @@ const player = {
   stalled: false, stalledAt: 0, stalls: 0,
 };
 const ENDS = { loop: "Loop", bounce: "Ping-pong", stop: "Once" }; // what happens at the last frame
+const TRUTHS = ["", "beside", "over", "minus"];
+const truth = { mode: "", loading: "", shown: "" }; // addresses of pictures
+const path = []; // views of a camera path, as packuv.film reads them
+const layered = { shown: -1, asked: -1 }; // segments
 const ruler = { on: false, points: [] }; // world
 const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
 const meter = { drawn: 0, frames: 0, since: performance.now(), sort_ms: 0, count: 0, moving: 0, seen: new Set() };
@@ -49,6 +54,12 @@ const receive = {
     Object.assign(buffer, { map, ahead });
     drawMarks();
   },
+  layers({ segment, layers }) {
+    if (segment !== layered.shown) return;
+    splats.setLayers(layers);
+    document.documentElement.dataset.layers = segment; // for automation
+    dirty = true;
+  },
   miss() { waiting = false; stale = false; },
   picture(message) {
     waiting = false;
@@ -56,6 +67,8 @@ const receive = {
     if (message.frame_codes) splats.setFrame(message.frame_codes.packed, message.frame_codes.rows);
     splats.setOrder(message.order, message.visible);
     spare = message.order.buffer;
+    layered.shown = message.segment;
+    if (look.mode === "layer") askLayers();
     settleRange(message.range, message.frame !== player.shown && player.shown >= 0);
     if (message.frame !== player.shown) meter.frames++;
     player.shown = message.frame;
@@ -83,6 +96,13 @@ function ask() {
   spare = null;
   waiting = true;
   stale = false;
+}
+
+// Layers of the UV map are told once for each segment on screen, and only to who looks at them.
+function askLayers() {
+  if (layered.asked === layered.shown || layered.shown < 0) return;
+  layered.asked = layered.shown;
+  worker.postMessage({ type: "layers" });
 }
 
 function tellPlayhead() {
@@ -189,6 +209,7 @@ function drawPicture() {
   meter.drawn++;
   drawRuler();
   outline(view.frame);
+  placeTruth(view.frame);
   showLegend();
   if (player.shown >= 0) document.documentElement.dataset.frame = player.shown; // for automation
 }
@@ -210,6 +231,45 @@ function outline([left, top, width, height]) {
   for (const button of at("cameras").children) {
     button.setAttribute("aria-current", String(button.dataset.camera === navigation.exact));
   }
+}
+
+// ---- what was filmed
+
+// The picture of the capture camera whose very view this is, over the outline of its picture or beside it.
+function placeTruth([left, top, width, height]) {
+  const camera = navigation.jump ? null : navigation.exact, picture = at("truth");
+  const filmed = truth.mode && player.shown >= 0 && scene.truth?.includes(camera);
+  picture.hidden = !filmed || !truth.shown.startsWith(`truth/${encodeURIComponent(camera)}/`);
+  if (!filmed) return;
+  const density = canvas.width / canvas.clientWidth, aside = truth.mode === "beside" ? canvas.clientWidth : 0;
+  const sides = { left: left / density + aside, top: top / density, width: width / density, height: height / density };
+  for (const [side, value] of Object.entries(sides)) picture.style[side] = `${value}px`;
+  picture.style.opacity = truth.mode === "over" ? at("share").value : 1;
+  fetchTruth(`truth/${encodeURIComponent(camera)}/${player.shown}.png`);
+}
+
+function fetchTruth(address) { // one at a time; what plays on meanwhile is shown next
+  if (truth.loading || truth.shown === address) return;
+  truth.loading = address;
+  const next = new Image();
+  next.src = address;
+  const settle = (found) => {
+    truth.loading = "";
+    truth.shown = found ? address : `${address} is not there`;
+    if (found) at("truth").src = next.src;
+    else at("truth").removeAttribute("src");
+    document.documentElement.dataset.truth = truth.shown; // for automation
+    dirty = true;
+  };
+  next.decode().then(() => settle(true), () => settle(false));
+}
+
+function setTruth(mode) {
+  truth.mode = scene.truth ? mode : "";
+  at("compare").value = truth.mode;
+  for (const name of TRUTHS.filter(Boolean)) document.body.classList.toggle(name, name === truth.mode);
+  at("share-row").hidden = truth.mode !== "over";
+  dirty = true;
 }
 
 function drawMarks() {
@@ -311,6 +371,8 @@ function fillPage() {
   at("cameras-head").hidden = !scene.cameras.length;
   for (const [name, mask] of bandsOf(scene.sh_degree)) at("bands").append(new Option(name, mask));
   at("bands-row").hidden = !scene.sh_degree;
+  at("truth-row").hidden = !scene.truth;
+  at("mode-layer").hidden = !scene.layers;
   grantWish();
   setPlaying(player.playing);
   setNear(0);
@@ -322,6 +384,7 @@ function grantWish() {
   if (wish.has("view")) navigation.recall(wish.get("view").split(",").map(Number));
   if (wish.has("bands")) setBands(Number(wish.get("bands")) || 0);
   if (ENDS[wish.get("ends")]) setEnds(wish.get("ends"));
+  if (TRUTHS.includes(wish.get("truth"))) setTruth(wish.get("truth"));
   if (MODES.includes(wish.get("mode"))) setMode(wish.get("mode"));
   if (wish.has("scale")) setScale(Number(wish.get("scale")) || 1);
   if (wish.has("background")) look.background = wish.get("background").split(",").map(Number);
@@ -337,7 +400,9 @@ let scrubbing = false;
 function press(id, pressed) { at(id).setAttribute("aria-pressed", String(pressed)); }
 
 function setMode(mode) {
+  if (mode === "layer" && !scene.layers) return; // a folder for the web does not hold them
   look.mode = mode;
+  if (mode === "layer") askLayers();
   for (const name of MODES) press(`mode-${name}`, name === mode);
   dirty = true;
 }
@@ -440,10 +505,40 @@ function linkHere() {
   now.set(...(navigation.exact ? ["camera", navigation.exact] : ["view", numbers.join(",")]));
   now.set("background", look.background.join(","));
   if (look.lines) now.set("cameras", 1);
+  if (truth.mode) now.set("truth", truth.mode);
   history.replaceState(null, "", `#${now}`);
   const told = () => notice("This page's address now shows this very view.");
   if (!navigator.clipboard) return told();
   navigator.clipboard.writeText(location.href).then(() => notice("The link to this view is copied."), told);
+}
+
+// Some seconds from view to view, or what the scene takes between their frames.
+function addView() {
+  const last = path.at(-1), frame = Math.max(0, player.shown);
+  const apart = last && Math.max(VIEW_SECONDS, Math.abs(scene.times_ns[frame] - scene.times_ns[last.frame]) / 1e9);
+  const { width, height, ...camera } = navigation.camera();
+  const whole = { width: Math.round(width), height: Math.round(height) };
+  path.push({ seconds: last ? last.seconds + apart : 0, frame, camera: { ...camera, ...whole } });
+  tellPath();
+}
+
+function takeBack() {
+  path.pop();
+  tellPath();
+}
+
+function tellPath() {
+  const { length } = path;
+  at("path-count").textContent = length ? `${length} view${length > 1 ? "s" : ""}, ${path.at(-1).seconds.toFixed(1)} s` : "no view";
+  at("path-save").disabled = !length;
+}
+
+function pathText() { return JSON.stringify({ format: "packuv-path", version: 1, scene: scene.name, views: path }, null, 1); }
+
+function savePath() {
+  if (!path.length) return notice("The camera path has no view yet; K adds one.");
+  document.documentElement.dataset.path = pathText(); // for automation
+  save(`${scene.name.replace(/\.\w+$/, "")}_path.json`, new Blob([pathText()], { type: "application/json" }));
 }
 
 function savePicture() {
@@ -499,10 +594,15 @@ const KEYS = {
   3: () => setMode("dynamic"),
   4: () => setMode("opacity"),
   5: () => setMode("map"),
+  6: () => setMode("layer"),
   b: () => { if (scene.sh_degree) cycleBands(); },
   i: () => at("stats").toggleAttribute("hidden"),
   m: () => setMeasuring(!ruler.on),
+  k: addView,
+  Backspace: takeBack,
+  j: savePath,
   p: savePicture,
+  t: () => setTruth(cycle(TRUTHS, truth.mode)),
   u: linkHere,
   v: () => setFolded(!document.body.classList.contains("folded")),
   x: () => { if (scene.worst !== undefined) { pause(); seek(scene.worst); } },
@@ -550,6 +650,10 @@ function listen() {
   at("back").onclick = () => KEYS.ArrowLeft({});
   at("forth").onclick = () => KEYS.ArrowRight({});
   at("bands").onchange = (event) => setBands(Number(event.target.value));
+  at("compare").onchange = (event) => setTruth(event.target.value);
+  at("share").oninput = (event) => { at("share-value").textContent = Number(event.target.value).toFixed(2); dirty = true; };
+  at("path-add").onclick = addView;
+  at("path-save").onclick = savePath;
   at("measure").onclick = KEYS.m;
   at("link").onclick = linkHere;
   at("shot").onclick = savePicture;

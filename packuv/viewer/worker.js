@@ -30,6 +30,7 @@ onmessage = (event) => {
   const message = event.data;
   if (message.type === "open") open().catch(complain);
   if (message.type === "show") show(message).catch((error) => { complain(error); postMessage({ type: "miss" }); });
+  if (message.type === "layers") tellLayers().catch(complain);
   if (message.type === "playhead") { playhead = message; prefetch(); }
 };
 
@@ -171,6 +172,18 @@ function keyOf(segment) {
   return promise;
 }
 
+// Layers of the UV map, by slot, of the segment that the page shows.
+async function tellLayers() {
+  const { segment } = sent;
+  if (segment < 0) return;
+  const [key, body] = await Promise.all([
+    keyOf(segment), get(`layers/${segment}.bin`).then((answer) => answer.arrayBuffer()),
+  ]);
+  const layers = new Uint8Array(key.slotCount);
+  new Uint8Array(body).forEach((layer, row) => { layers[key.slots[row]] = layer; });
+  postMessage({ type: "layers", segment, layers }, [layers.buffer]);
+}
+
 // ---- unpacking: Gaussians go into slots, the dynamic ones first, so that a frame is one upload
 
 function unpackKey(bytes, segment) {
@@ -185,7 +198,7 @@ function unpackKey(bytes, segment) {
   for (let row = 0; row < count; row++) slots[row] = dynamic[row] ? first++ : second++;
   const packed = new ArrayBuffer(16 * layers * slotCount);
   const [x, y, z] = [0, 1, 2].map(() => new Float32Array(slotCount));
-  const key = { segment, count, moving, rows, slotCount, packed, x, y, z, alive: new Uint8Array(slotCount) };
+  const key = { segment, count, moving, rows, slotCount, slots, packed, x, y, z, alive: new Uint8Array(slotCount) };
   const shorts = new Uint16Array(packed), octets = new Uint8Array(packed);
   for (let axis = 0; axis < 3; axis++) {
     for (let row = 0; row < count; row++) shorts[8 * slots[row] + axis] = xyz[axis * count + row];

@@ -10,7 +10,9 @@ import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from pipelines.commands.frames import frames_of
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from packuv.camera import PinholeCamera
+    from packuv.footage import Views
+    from packuv.scene import SceneHeader
     from packuv.scene.verify import VerifyReport
 
 MOST_STARTS = 16
@@ -201,6 +205,22 @@ def render(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def film(arguments: argparse.Namespace) -> int:
+    """`packuv film`: one MP4 along a camera path."""
+    from packuv.film import CameraPath
+    from packuv.film import film as shoot
+    from packuv.fit.device import choose_device
+    from packuv.scene import open_scene
+
+    if arguments.output.suffix.lower() != ".mp4":
+        raise ValueError(f"the film becomes an MP4, so its name must end with .mp4, but is {arguments.output.name}")
+    path, device = CameraPath.load(arguments.path), choose_device(arguments.device)
+    with open_scene(arguments.scene) as scene, shown(arguments, "film") as progress:
+        count = shoot(scene, path, arguments.output, progress, rate=arguments.fps, size=arguments.size, device=device)
+    print(f"{arguments.output}: {count} pictures, {path.seconds:g} s, {len(path.views)} views")
+    return 0
+
+
 def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:
     """A camera of the scene by name, or one from a JSON file in the scene's own form."""
     from packuv.bounds import fields
@@ -291,15 +311,55 @@ def _score_text(means: Mapping[str, float | None], kind: str) -> str:
 
 def view(arguments: argparse.Namespace) -> int:
     """`packuv view`: until Ctrl-C."""
+    from packuv.scene import open_scene
     from packuv.viewer import serve
     from packuv.viewer.server import LOOPBACK
 
-    worst = _worst_frame(arguments.scene.parent)
+    folder = arguments.scene.parent
+    worst, capture = _worst_frame(folder), arguments.capture or _capture_of(folder)
+    if capture and not capture.is_dir():
+        raise FileNotFoundError(f"no capture folder {capture}; name the one that the scene was made from, or none")
     if arguments.host not in LOOPBACK:
         told = f"packuv: everyone who can reach {arguments.host} sees this scene, without a password; end with Ctrl-C"
         print(told, file=sys.stderr)
-    serve(arguments.scene, host=arguments.host, port=arguments.port, open_browser=True, worst=worst)
+    with open_scene(arguments.scene) as scene:
+        truth = Filmed(scene.header, capture) if capture else None
+    serve(arguments.scene, host=arguments.host, port=arguments.port, open_browser=True, worst=worst, truth=truth)
     return 0
+
+
+class Filmed:
+    """What a capture's cameras filmed at the frames of a scene, see `packuv.viewer.source.Truth`. The videos are opened
+    when somebody looks."""
+
+    def __init__(self, header: SceneHeader, capture: Path) -> None:
+        from tasks.stages.evaluate import known_cameras
+
+        self.cameras = known_cameras(header)
+        self._header, self._capture, self._guard = header, capture, Lock()
+
+    def picture(self, camera: str, frame: int) -> np.ndarray | None:
+        from packuv.colour import lit
+        from packuv.score import as_pixels
+
+        with self._guard:
+            picture = self._views.picture(self.cameras.index(camera), frame)
+        return None if picture is None else as_pixels(lit(picture, self._header.light[frame]))
+
+    @cached_property
+    def _views(self) -> Views:
+        from tasks.stages.evaluate import filmed_views
+
+        return filmed_views(self._header, self._capture, self.cameras)
+
+
+def _capture_of(folder: Path) -> Path | None:
+    """Of the run that a folder is of, where it is still there."""
+    try:
+        capture = Path(json.loads((folder / "run.json").read_text())["request"]["capture"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return capture if capture.is_dir() else None
 
 
 def _worst_frame(folder: Path) -> int | None:

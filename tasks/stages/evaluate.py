@@ -145,24 +145,36 @@ def evaluate_scene(
         names = tuple(cameras or header.held_out) or spread(fitted, options.fitted_cameras)
         if unknown := [name for name in names if name not in lenses]:
             raise ValueError(f"the scene has no camera {', '.join(unknown)}; it has {', '.join(lenses)}")
-        groups = _matched(capture, header.sync)
-        rows = _rows(groups, header.times_ns)
-        columns = [groups.cameras.index(name) for name in names]
-        frames = groups.frames[rows][:, columns]
-        said = header.extra.get("transfer")
-        views = Views(
-            find_capture(capture).videos,
-            frames,
-            [lenses[name] for name in names],
-            max_width=_max_width(header.extra),
-            transfer=Transfer(said) if said else None,
-            light=_light(header).of(names, len(frames)),
-        )
+        views = filmed_views(header, capture, names)
         silhouettes, doubtful = _silhouettes(capture, views)
         lpips = Lpips(weights) if weights else None
         scores = score(opened, views, progress, lpips=lpips, silhouettes=silhouettes, device=device)
         facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
         return {**facts, "doubtful_masks": doubtful} if doubtful else facts
+
+
+def known_cameras(header: SceneHeader) -> tuple[str, ...]:
+    """Cameras whose pictures can be compared with a scene."""
+    return tuple(_lenses(header.extra))
+
+
+def filmed_views(header: SceneHeader, capture: Path, cameras: Sequence[str]) -> Views:
+    """What these cameras of a capture folder filmed at the instants of a scene, frame by frame. Raises ValueError for
+    a capture that did not film them."""
+    groups, lenses = _matched(capture, header.sync), _lenses(header.extra)
+    rows = _rows(groups, header.times_ns)
+    if unknown := [name for name in cameras if name not in groups.cameras]:
+        raise ValueError(f"{capture} has no camera {', '.join(unknown)}; it has {', '.join(groups.cameras)}")
+    frames = groups.frames[rows][:, [groups.cameras.index(name) for name in cameras]]
+    said = header.extra.get("transfer")
+    return Views(
+        find_capture(capture).videos,
+        frames,
+        [lenses[name] for name in cameras],
+        max_width=_max_width(header.extra),
+        transfer=Transfer(said) if said else None,
+        light=_light(header).of(tuple(cameras), len(frames)),
+    )
 
 
 def _silhouettes(capture: Path, views: Views) -> tuple[Silhouettes | None, dict[str, str]]:

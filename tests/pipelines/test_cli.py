@@ -14,6 +14,7 @@ from pipelines import cli
 from pipelines.cli import FAILED, INTERRUPTED, OK, WRONG, main, parser
 from pipelines.commands.run import request_from
 from pipelines.request import RunRequest, read_settings
+from tests.packuv.test_score import LIGHT, write_wall
 
 
 @pytest.mark.parametrize(
@@ -205,3 +206,17 @@ def test_what_a_file_is_called_does_nothing_to_the_terminal(tmp_path, capsys):
     assert said[:-1].isprintable()
     assert main(["info", "a" * 10_000]) == WRONG
     assert len(capsys.readouterr().err) < 2_100
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--capture", "{}/none"], "no capture folder"),
+        (["--host", "198.51.100.7"], "everyone who can reach 198.51.100.7 sees this scene"),
+        (["--host", "198.51.100.7"], "--host must be an address of this machine"),
+    ],
+)
+def test_view_says_who_may_look_and_what_is_not_there(words, message, tmp_path, capsys):
+    path = write_wall(tmp_path / "scene.mkv", 0 * LIGHT)
+    assert main(["view", str(path), *(word.format(tmp_path) for word in words)]) == 2
+    assert message in capsys.readouterr().err

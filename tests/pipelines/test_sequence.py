@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from calibration.rig import Rig
 from packuv.scene import open_scene
 from pipelines.cli import main
 from pipelines.commands.progress import TerminalProgress
+from pipelines.commands.scenes import Filmed, _capture_of, _worst_frame
 from pipelines.events import Journal
 from pipelines.process import Engine, Outcome, jobs_of, process, process_directly
 from pipelines.request import RunRequest
@@ -109,6 +111,27 @@ def test_run_leaves_scene_report_and_record(first, capture):
     assert Store(outcome.folder / "store").verify() == []
     assert not [path for path in (outcome.folder / "store" / ".work").iterdir() if path.is_dir()]
     assert outcome.scene.stat().st_nlink == 2
+
+
+def test_the_viewer_of_a_run_finds_what_was_filmed_and_the_worst_frame(first, capture):
+    outcome, _ = first
+    assert _capture_of(outcome.folder) == capture
+    assert _capture_of(capture) is None
+    report = json.loads((outcome.folder / "report.json").read_text())
+    by_frame = {score["frame"]: score["psnr_db"] for score in report["scores"]}  # of one camera
+    assert _worst_frame(outcome.folder) == min(by_frame, key=lambda frame: by_frame[frame])
+    assert _worst_frame(capture) is None
+    with open_scene(outcome.scene) as scene:
+        filmed = Filmed(scene.header, capture)
+    index = outcome.folder / "store" / artefacts(outcome)["evaluate"] / "pictures"
+    for item in json.loads((index / "index.json").read_text())["pictures"]:
+        truth = cv2.imread(str(index / item["truth"]))[..., ::-1].astype(float)
+        shown = filmed.picture(item["camera"], item["frame"])
+        assert shown is not None
+        assert np.abs(shown - truth).mean() < 12  # the same but for the camera's gains and exposure
+    assert filmed.picture("cam01", 0).shape == truth.shape
+    with pytest.raises(ValueError, match="must have"):
+        Filmed(scene.header, capture / "videos").picture("cam01", 0)
 
 
 def test_info_and_verify_tell_what_the_scene_is(first, capsys, tmp_path):

@@ -19,6 +19,7 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -26,9 +27,12 @@ from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
 from packuv.colour import lit
-from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
+from packuv.film import CameraPath
+from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
+from packuv.gaussians.uvmap import assign_slots
+from packuv.gaussians.uvsize import UvOptions
 from packuv.raster import RasterOptions, render
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.viewer import serve
@@ -40,6 +44,7 @@ from packuv.viewer.source import (
     describe,
     frame_bytes,
     key_bytes,
+    layer_bytes,
     near_plane,
     open_source,
     tables_bytes,
@@ -670,3 +675,127 @@ def test_a_port_that_is_taken_is_named(scene_path: Path) -> None:
             serve(scene_path, port=port)
     with pytest.raises(ValueError, match="--host must be an address of this machine"):
         serve(scene_path, host="198.51.100.7")
+
+
+class Drawn:
+    """Pictures of which the viewer's own should differ by rounding alone; of a camera and frame there is none."""
+
+    cameras = ("cam0", "cam1", "ca/m ü")
+
+    def __init__(self, source: SegmentSource) -> None:
+        self._source = source
+
+    def picture(self, camera: str, frame: int) -> np.ndarray | None:
+        if camera != "cam1" or frame == 3:
+            return None
+        gaussians = self._source.quantizer.decode(self._source.parts[0].frame(frame))
+        background = (0.2, 0.4, 0.6)
+        drawn = render(gaussians, self._source.cameras[1], options=NEAR, background=background).colour
+        pixels: np.ndarray = np.rint(255 * np.clip(drawn, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
+        return pixels
+
+
+def test_what_was_filmed_is_served_exactly_and_only_where_there_is_something() -> None:
+    source = make_source()
+    with running(source) as server:
+        assert "truth" not in json.loads(fetch(server, "/scene.json")[1])
+        assert fetch(server, "/truth/cam1/0.png")[0].status == 404
+        truth = Drawn(source)
+        server.truth = truth
+        assert json.loads(fetch(server, "/scene.json")[1])["truth"] == list(truth.cameras)
+        answer, body = fetch(server, "/truth/cam1/2.png")
+        assert (answer.status, answer.getheader("Content-Type")) == (200, "image/png")
+        shown = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        assert np.array_equal(shown, truth.picture("cam1", 2))
+        for path in ("cam1/3.png", "cam1/8.png", "cam9/0.png", "ca%2Fm%20%C3%BC/0.png", "cam1/00.png", "../x/0.png"):
+            assert fetch(server, f"/truth/{path}")[0].status == 404
+
+
+@pytest.mark.slow
+def test_what_was_filmed_lies_beside_over_and_minus_the_render(browser: Browser) -> None:
+    source = replace(make_source(), near=0.1)
+    camera, element = source.cameras[1], "document.documentElement.dataset"
+
+    def page(mode: str, width: int, height: int, frame: int = 2) -> np.ndarray:
+        wish = f"bare=1&play=0&frame={frame}&camera=cam1&background=0.2,0.4,0.6&truth={mode}"
+        shown_at(browser, server, wish, width, height, frame)
+        browser.wait_for(f"{element}.truth !== undefined")
+        time.sleep(0.5)  # drawn
+        return browser.picture().astype(np.float64)
+
+    with running(source) as server:
+        server.truth = Drawn(source)
+        filmed = server.truth.picture("cam1", 2)
+        assert filmed is not None
+        assert page("minus", camera.width, camera.height).mean() < 4 * 0.5  # four times brighter; rounding to 8 bits
+        both = page("beside", 2 * camera.width, camera.height)
+        left, right = both[:, : camera.width], both[:, camera.width :]
+        assert np.abs(right - filmed).max() <= 1
+        assert np.abs(left - filmed).mean() < 0.5
+        assert np.abs(page("over", camera.width, camera.height) - filmed).mean() < 0.5
+        page("over", camera.width, camera.height, frame=3)
+        assert browser.evaluate(f"{element}.truth") == "truth/cam1/3.png is not there"
+        assert browser.evaluate("document.getElementById('truth').hidden || !document.getElementById('truth').src")
+
+
+@pytest.mark.slow
+def test_the_page_writes_camera_paths_that_films_read(browser: Browser, tmp_path: Path) -> None:
+    source, element = make_source(), "document.documentElement.dataset"
+    with running(source) as server:
+        shown_at(browser, server, "play=0&frame=2&camera=cam1", 320, 240, 2)
+        press(browser, "k")
+        press(browser, "]")
+        press(browser, "End")
+        browser.wait_for(f"{element}.frame == 7")
+        browser.wait_for("document.querySelector('#cameras [aria-current=true]').dataset.camera == 'cam2'")
+        time.sleep(1)  # it has flown there
+        for key in ("k", "k", "Backspace", "j"):
+            press(browser, key)
+        (tmp_path / "path.json").write_text(browser.evaluate(f"{element}.path"))
+    path = CameraPath.load(tmp_path / "path.json")
+    assert [(view.seconds, view.frame) for view in path.views] == [(0, 2), (2, 7)]
+    for view, camera in zip(path.views, source.cameras[1:3], strict=True):
+        wanted = camera.to_json()
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):
+            assert getattr(view.camera, name) == pytest.approx(wanted[name])
+        assert np.allclose(view.camera.camera_from_world, camera.camera_from_world, atol=1e-9)
+
+
+def test_layers_are_those_of_the_atlas() -> None:
+    source = make_source(count=3000)
+    with running(source) as server:
+        assert json.loads(fetch(server, "/scene.json")[1])["layers"] == UvOptions().layers
+        for number, part in enumerate(source.parts):
+            layers = np.frombuffer(fetch(server, f"/layers/{number}.bin")[1], np.uint8)
+            opacity = part.key.attributes[:, OPACITY]
+            shown = opacity > 0
+            points = source.quantizer.decode(part.key[shown]).means
+            slots = assign_slots(points, opacity[shown], source.quantizer.centre, options=UvOptions())
+            assert np.array_equal(layers[shown], slots.layer + 1)
+            assert not layers[~shown].any()
+        assert fetch(server, "/layers/3.bin")[0].status == 404
+
+
+@pytest.mark.slow
+def test_the_page_colours_by_layer(browser: Browser) -> None:
+    """One opaque Gaussian behind the other, seen from the centre: the first layer takes the more opaque one."""
+    source, camera = make_source(), make_ring()[0]
+    first = np.array([0.4, 0.1, 0.6])
+    centre = source.quantizer.centre
+    points = np.array([centre + first, centre + 0.8 * first + [0, 0, 1e-5]])
+    still, opacity = np.array([[1.0, 0, 0, 0]] * 2), np.array([OPACITY_RANGE[1], 1.0])
+    values = points, np.full((2, 3), -1.6), still, opacity, np.zeros((2, 1, 3))
+    codes = source.quantizer.encode(Gaussians(*(value.astype(np.float32) for value in values)))
+    part = Segment(0, codes, np.zeros(2, bool), np.empty((0, 0, 3), np.uint16), np.empty((0, 0, 10), np.uint8))
+    taken = np.frombuffer(layer_bytes(replace(source, parts=(part,)), 0), np.uint8)
+    with running(replace(source, parts=(part,), cameras=(camera,), near=0.1)) as server:
+        shown_at(browser, server, "play=0&frame=0&bare=1&mode=layer&background=0,0,0", camera.width, camera.height, 0)
+        browser.wait_for("document.documentElement.dataset.layers == 0")
+        time.sleep(0.5)
+        shown = browser.picture().astype(int)
+    far = np.argmax(codes.attributes[:, OPACITY])
+    pixel, _ = camera.project(source.quantizer.decode(codes).means[[far]])
+    x, y = pixel[0].astype(int)
+    assert sorted(taken) == [1, 2] or sorted(taken) == [1, 1]
+    assert shown[y, x].min() > 60  # light, for the first layer is there
+    assert shown[y, x, 0] > 0.8 * shown[y, x, 2]  # and not purple or blue

@@ -1,0 +1,206 @@
+"""A film of a scene along a camera path: the path as a file, the cameras between its views, and the MP4.
+
+The viewer writes such files; docs/viewer.md describes them.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+
+import av
+import numpy as np
+
+from packuv.bounds import field, fields, finite, items, whole
+from packuv.camera import PinholeCamera
+from packuv.colour import lit
+from packuv.files import load_json, whole_file
+from packuv.progress import Progress
+from packuv.scene import Scene
+from packuv.score import Artist, as_pixels
+
+FORMAT, VERSION = "packuv-path", 1
+MOST_VIEWS, MOST_SECONDS = 1000, 3600.0
+CODING = {"crf": "16", "preset": "medium", "threads": "1"}
+"""Of x264; one thread, for its output depends on their number"""
+
+
+@dataclass(frozen=True)
+class PathView:
+    """Where the camera is at one moment of the film."""
+
+    seconds: float
+    """From the start of the film"""
+    frame: int
+    """Of the scene"""
+    camera: PinholeCamera
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Views at least one, in order of time; between them the eye goes on a smooth curve, turning evenly."""
+
+    views: tuple[PathView, ...]
+
+    def __post_init__(self) -> None:
+        if not self.views:
+            raise ValueError("a camera path needs a view, but has none; add one in the viewer (K)")
+        times = [view.seconds for view in self.views]
+        if times[0] != 0 or any(after <= before for before, after in pairwise(times)):
+            raise ValueError(f"the seconds of a path's views must begin at 0 and rise, but are {times[:8]}")
+
+    @classmethod
+    def load(cls, path: Path) -> CameraPath:
+        """Raises ValueError, which names the file, for one that holds no path."""
+        try:
+            told = fields(load_json(path), "a camera path")
+            if (told.get("format"), told.get("version")) != (FORMAT, VERSION):
+                raise ValueError(f"a camera path says format {FORMAT!r} and version {VERSION}")
+            listed = items(field(told, "views", "a camera path"), "views", most=MOST_VIEWS)
+            return cls(tuple(_view(one, f"view {number}") for number, one in enumerate(listed)))
+        except ValueError as error:
+            raise ValueError(f"{path} is no camera path: {error}") from None
+
+    @property
+    def seconds(self) -> float:
+        """Of the whole film."""
+        return self.views[-1].seconds
+
+    def at(self, seconds: float) -> tuple[int, PinholeCamera]:
+        """Frame of the scene and camera at a moment of the film; before and after it, of its ends."""
+        times = [view.seconds for view in self.views]
+        place = min(max(bisect_right(times, seconds) - 1, 0), max(len(times) - 2, 0))
+        before, after = self.views[place], self.views[min(place + 1, len(times) - 1)]
+        share = min(max((seconds - before.seconds) / ((after.seconds - before.seconds) or 1), 0.0), 1.0)
+        frame = round(before.frame + share * (after.frame - before.frame))
+        turned = _turned(before.camera.camera_from_world[:3, :3], after.camera.camera_from_world[:3, :3], share)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turned, -turned @ self._eye(place, share)
+        return frame, _between(before.camera, after.camera, share, pose)
+
+    def _eye(self, place: int, share: float) -> np.ndarray:
+        """On a cubic through all eyes, [3]: as fast at a view as the line from the one before to the one after it."""
+        eyes, times = [view.camera.centre for view in self.views], [view.seconds for view in self.views]
+
+        def speed(index: int) -> np.ndarray:
+            low, high = max(index - 1, 0), min(index + 1, len(eyes) - 1)
+            return np.asarray((eyes[high] - eyes[low]) / ((times[high] - times[low]) or 1))
+
+        last = min(place + 1, len(eyes) - 1)
+        span, s = times[last] - times[place], share
+        start, end = speed(place) * span, speed(last) * span
+        return np.asarray(
+            (2 * s**3 - 3 * s**2 + 1) * eyes[place]
+            + (s**3 - 2 * s**2 + s) * start
+            + (3 * s**2 - 2 * s**3) * eyes[last]
+            + (s**3 - s**2) * end
+        )
+
+
+def _view(told: object, what: str) -> PathView:
+    one = fields(told, what)
+    seconds = finite(field(one, "seconds", what), f"{what}: seconds")
+    if not 0 <= seconds <= MOST_SECONDS:
+        raise ValueError(f"{what}: seconds must be from 0 to {MOST_SECONDS:g}, but are {seconds:g}")
+    frame = whole(field(one, "frame", what), f"{what}: frame", most=10**9)
+    camera = fields(field(one, "camera", what), f"{what}: camera")
+    found = PinholeCamera.from_json({"name": what, **camera})
+    turn = found.camera_from_world[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
+        raise ValueError(f"{what}: camera_from_world must begin with a rotation, but has {turn.round(3).tolist()}")
+    return PathView(seconds, frame, found)
+
+
+def _turned(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
+    """The rotation [3, 3] a share of the way from one to another, about one axis."""
+    vector = _vector(b @ a.T) * share
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return a
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    step = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return np.asarray(step @ a)
+
+
+def _vector(rotation: np.ndarray) -> np.ndarray:
+    """Axis times angle, radians, [3], of a rotation [3, 3]; of a half turn either axis."""
+    angle = float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
+    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    if np.pi - angle > 1e-4:
+        length = float(np.linalg.norm(skew))
+        return np.asarray(skew / length * angle) if length > 1e-12 else np.zeros(3)
+    axes = rotation + np.eye(3)  # 2 axis axis^T at a half turn
+    axis = axes[:, int(np.argmax(np.diag(axes)))]
+    return np.asarray(axis / np.linalg.norm(axis) * angle)
+
+
+def _between(a: PinholeCamera, b: PinholeCamera, share: float, pose: np.ndarray) -> PinholeCamera:
+    """Optics between those of two cameras, in the picture size of the first one."""
+    b = fitted(b, a.width, a.height)
+    fx, fy, cx, cy = (getattr(a, name) + share * (getattr(b, name) - getattr(a, name)) for name in OPTICS)
+    return replace(a, fx=fx, fy=fy, cx=cx, cy=cy, camera_from_world=pose)
+
+
+OPTICS = ("fx", "fy", "cx", "cy")
+
+
+def fitted(camera: PinholeCamera, width: int, height: int) -> PinholeCamera:
+    """The camera in a picture of this size, in the middle of which the whole of its own picture lies, as the viewer
+    shows it."""
+    scale = min(width / camera.width, height / camera.height)
+    left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
+    return replace(
+        camera, width=width, height=height, fx=scale * camera.fx, fy=scale * camera.fy,
+        cx=scale * camera.cx + left, cy=scale * camera.cy + top,
+    )  # fmt: skip
+
+
+def film(
+    scene: Scene,
+    path: CameraPath,
+    output: Path,
+    progress: Progress,
+    *,
+    rate: Fraction | None = None,
+    size: tuple[int, int] | None = None,
+    device: str = "cpu",
+) -> int:
+    """Write an MP4 (H.264, 4:2:0) of the scene along a path, in the light of its frames; returns its pictures.
+
+    `rate` is the film's, by default the scene's; `size` the width and height, by default those of the first view, made
+    even. The file is whole or not there. Raises ValueError for a path that names frames which the scene lacks.
+    """
+    rate = rate or scene.header.rate
+    first = path.views[0].camera
+    width, height = size or (first.width // 2 * 2, first.height // 2 * 2)
+    if width % 2 or height % 2 or min(width, height) < 2:
+        raise ValueError(f"H.264 needs even width and height, but the film's size is {width}x{height}")
+    if missing := [view.frame for view in path.views if view.frame >= len(scene)]:
+        raise ValueError(f"the scene has frames 0 to {len(scene) - 1}, but the path shows {missing[0]}")
+    count = int(Fraction(path.seconds) * rate) + 1
+    with whole_file(output) as part, av.open(str(part), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=rate, options=CODING)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        moments = [path.at(float(number / rate)) for number in range(count)]
+        for done, picture in enumerate(_pictures(scene, moments, (width, height), device), start=1):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            progress(done, count)
+        container.mux(stream.encode(None))
+    return count
+
+
+def _pictures(
+    scene: Scene, moments: Sequence[tuple[int, PinholeCamera]], size: tuple[int, int], device: str
+) -> Iterator[np.ndarray]:
+    """uint8 [H, W, 3] of each moment."""
+    artist, shown, gaussians = Artist(scene, device), -1, scene.gaussians(moments[0][0])
+    for frame, camera in moments:
+        if frame != shown:
+            gaussians, shown = scene.gaussians(frame), frame
+        drawn = artist.draw(gaussians, fitted(camera, *size))
+        yield np.ascontiguousarray(as_pixels(lit(drawn, scene.light(frame))))
