@@ -7,9 +7,11 @@ parents instead of a threshold, so a run's size and memory are known beforehand.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from packuv.camera import PinholeCamera
 from packuv.fit.model import Model
 from packuv.fit.start.bounds import Bounds
 from packuv.gaussians.floats import Gaussians, logit, opacity, rotation_matrices, rows_of
@@ -34,9 +36,23 @@ class DensityOptions:
     """Longest standard deviation allowed, in scene radii"""
     large: float = 0.005
     """A Gaussian with a standard deviation above this many radii is split, one below is cloned"""
+    least_views: int = 2
+    """Cameras that must show a Gaussian of what is fitted first, when `SUPPORTED_AT` tells; one that does so from afar
+    counts as all. Others are pruned: nobody sees them, or one camera alone explains its picture by them, close before
+    it, where they hide what others would see. 0 keeps all"""
+    least_shown: float = 0.05
+    """Blending weight from which on a camera shows a Gaussian, as a share of a picture's pixels for each of the cap.
+    With 0.5 "basketball" loses 0.7 dB where nothing moves: small ones are detail"""
+    afar: float = 0.5
+    """Depth of a Gaussian, as a share of the median one in the picture; with 0.8 "basketball" loses 0.3 dB there: many
+    of its cameras have places of their own"""
     min_gradient: float = 0.0
     """Mean screen gradient under which a Gaussian contributes nothing and is pruned (paper, appendix; with the sense
     of the inequality that its text states)"""
+
+
+SUPPORTED_AT = (0.4, 0.75, 1.0)
+"""Shares of the iterations in which Gaussians are added, after which those that too few cameras show are pruned"""
 
 
 class ScreenGradient:
@@ -79,6 +95,16 @@ def prune(
     slots = assign_slots(means, np.concatenate([reserved, g.opacity_logits[rows]]), bounds.centre, options=uv)
     keep[rows] = slots.kept[len(taken) :]
     return keep
+
+
+def views_showing(rendering: Any, means: np.ndarray, camera: PinholeCamera, options: DensityOptions) -> np.ndarray:
+    """How much the picture of one camera, rendered with weights, counts for each Gaussian at `means`, float32 [N, 3]:
+    0, 1, or `options.least_views` from afar; int [N]."""
+    shown = rendering.weights >= options.least_shown * camera.width * camera.height / options.cap
+    drawn = rendering.alpha > 0.5
+    usual = float(np.median(rendering.depth[drawn] / rendering.alpha[drawn])) if drawn.any() else 0.0
+    depth = means @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+    return np.asarray(shown * np.where(depth >= options.afar * usual, options.least_views, 1))
 
 
 def grow(

@@ -28,6 +28,7 @@ from packuv.each import Each, as_bits, packed
 from packuv.files import open_npz, save_json, save_npz
 from packuv.fit.backdrop import Backdrop, joined
 from packuv.fit.bands import Judgement, judge, left_out, still_bands
+from packuv.fit.density import SUPPORTED_AT
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
 from packuv.fit.shots import Shot, find_shots, halved, moving_rows
@@ -182,6 +183,10 @@ def _fit_all(
                                   gain=options.sh_gain, options=options.photometric)  # fmt: skip
         model = solver.model
         ticks.advance(solver.done - done)
+    for share in SUPPORTED_AT if options.density.least_views else ():
+        pause = min(round(share * options.density.until * total), floating)
+        solver.run(shots, pause - solver.done, of=total, grow_from=grow_from, ticks=ticks)
+        solver.keep(solver.supported(shots))
     solver.run(shots, floating - solver.done, of=total, grow_from=grow_from, ticks=ticks)
     solver.keep(solver.worth_keeping())
     model.gaussians = with_canonical_axes(model.gaussians)

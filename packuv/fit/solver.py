@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from packuv.fit.backdrop import Backdrop
-from packuv.fit.density import ScreenGradient, grow, prune, relocate
+from packuv.fit.density import ScreenGradient, grow, prune, relocate, views_showing
 from packuv.fit.guard import Guard
 from packuv.fit.labels import active_tiles
 from packuv.fit.model import Model, Rates
@@ -351,6 +351,15 @@ class Solver:
         """Rows that pruning leaves, bool [N]."""
         options, taken = self._options, self.backdrop.gaussians.means
         return prune(self.model, self.gradient, taken, bounds=self.bounds, options=options.density, uv=options.uv)
+
+    def supported(self, shots: Sequence[Shot]) -> np.ndarray:
+        """Rows that enough cameras show, bool [N]; for a fit of all that these see."""
+        raster, density = RasterOptions(self.bounds.near, device=self._options.device), self._options.density
+        views = np.zeros(len(self.model), np.int64)
+        for shot in shots:
+            rendering = render(self._decoded(), shot.camera, options=raster, weights=True, arena=self._arena)
+            views += views_showing(rendering, self.model.gaussians.means, shot.camera, density)
+        return views >= density.least_views
 
     def _change_density(self, of: int, grow_from: int) -> None:
         """Prune, then grow towards the cap."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from packuv.budget import Budget
-from packuv.fit.density import DensityOptions
+from packuv.fit.density import DensityOptions, views_showing
 from packuv.fit.frames import fit_segment
 from packuv.fit.keyframe import DEAD_CODE, KeyState, fit_backdrop, fit_first, fit_next, inside
 from packuv.fit.options import FitOptions
@@ -104,6 +104,25 @@ def test_the_first_keyframe_explains_its_pictures_through_its_codes(views, key):
     assert error(views, decoded, 0, key.bounds.near) > 18.5
     assert error(views, decoded, 0, key.bounds.near) > error(views, key.gaussians, 0, key.bounds.near) - 0.1
     assert len(key.gaussians) <= OPTIONS.density.cap
+
+
+def test_what_one_camera_alone_sees_close_before_it_goes(ring):
+    """Two walls that all cameras see, and before the first one a patch that nobody else has in view."""
+    cameras, rng = ring(6), np.random.default_rng(1)
+    wall = rng.uniform(-1, 1, (200, 3)) * [1, 1, 0.3]
+    pose = np.linalg.inv(cameras[0].camera_from_world)
+    close, behind = (pose @ [0.05 * cameras[0].width / cameras[0].fx * z, 0, z, 1] for z in (0.3, -1.0))
+    xyz = np.vstack([wall, close[None, :3], behind[None, :3]])
+    scale = np.append(np.full(200, 0.2), [0.02, 0.02])
+    gaussians = round_gaussians(xyz, np.full((202, 3), 0.5), scale, opacity=0.9, sh_degree=0)
+    options = DensityOptions(cap=2000, least_shown=0.5)
+    views = sum(
+        views_showing(render(gaussians, camera, options=RasterOptions(0.1), weights=True), xyz, camera, options)
+        for camera in cameras
+    )
+    assert views[200] == 1
+    assert views[201] == 0
+    assert (views[:200] >= options.least_views).mean() > 0.9
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(views, key):
@@ -357,6 +376,9 @@ def test_what_changes_everywhere_shows(key, segment, views):
 
 
 def test_the_tail_is_the_last_frame_without_its_empty_rows(key, segment):
+    attributes = segment.attributes.copy()
+    attributes[-1, :3, OPACITY] = 0
+    segment = dataclasses.replace(segment, attributes=attributes)
     last, state = segment.frame(BORDER - 1), tail(key, segment)
     assert state.instant == BORDER - 1
     assert len(state.gaussians) == int((last.attributes[:, OPACITY] > 1).sum()) < len(last)
