@@ -19,7 +19,7 @@ from packuv.raster import RasterOptions, render
 
 OPTIONS = FitOptions(
     iterations=150, key_iterations=80, key_births=120, near_jitter=0.0, random_background=False,
-    start=StartOptions(count=500), density=DensityOptions(cap=900, every=25),
+    start=StartOptions(count=500), density=DensityOptions(cap=900, every=25, least_views=0),
 )  # fmt: skip
 FRAMES, DATE = 6, 3
 
