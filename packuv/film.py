@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 
 from packuv.bounds import field, fields, finite, items, whole
@@ -118,26 +119,7 @@ def _view(told: object, what: str) -> PathView:
 
 def _turned(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
     """The rotation [3, 3] a share of the way from one to another, about one axis."""
-    vector = _vector(b @ a.T) * share
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return a
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    step = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return np.asarray(step @ a)
-
-
-def _vector(rotation: np.ndarray) -> np.ndarray:
-    """Axis times angle, radians, [3], of a rotation [3, 3]; of a half turn either axis."""
-    angle = float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
-    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    if np.pi - angle > 1e-4:
-        length = float(np.linalg.norm(skew))
-        return np.asarray(skew / length * angle) if length > 1e-12 else np.zeros(3)
-    axes = rotation + np.eye(3)  # 2 axis axis^T at a half turn
-    axis = axes[:, int(np.argmax(np.diag(axes)))]
-    return np.asarray(axis / np.linalg.norm(axis) * angle)
+    return np.asarray(cv2.Rodrigues(share * cv2.Rodrigues(b @ a.T)[0])[0] @ a)
 
 
 def _between(a: PinholeCamera, b: PinholeCamera, share: float, pose: np.ndarray) -> PinholeCamera:

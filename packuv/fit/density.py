@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from packuv.camera import PinholeCamera
+from packuv.fit.depth import COVERED
 from packuv.fit.model import Model
 from packuv.fit.start.bounds import Bounds
 from packuv.gaussians.floats import Gaussians, logit, opacity, rotation_matrices, rows_of
@@ -101,7 +102,7 @@ def views_showing(rendering: Any, means: np.ndarray, camera: PinholeCamera, opti
     """How much the picture of one camera, rendered with weights, counts for each Gaussian at `means`, float32 [N, 3]:
     0, 1, or `options.least_views` from afar; int [N]."""
     shown = rendering.weights >= options.least_shown * camera.width * camera.height / options.cap
-    drawn = rendering.alpha > 0.5
+    drawn = rendering.alpha > COVERED
     usual = float(np.median(rendering.depth[drawn] / rendering.alpha[drawn])) if drawn.any() else 0.0
     depth = means @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
     return np.asarray(shown * np.where(depth >= options.afar * usual, options.least_views, 1))

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+COVERED = 0.5
+"""Alpha from which on the depth of a pixel counts"""
+
 
 @dataclass(frozen=True)
 class SparseDepth:
@@ -29,7 +32,7 @@ def depth_loss(
     Pixels that are less than half covered do not count (paper §4.2: sparse structure-from-motion depth).
     """
     d_depth, d_alpha = np.zeros_like(depth), np.zeros_like(alpha)
-    covered = alpha.ravel()[known.pixels] > 0.5
+    covered = alpha.ravel()[known.pixels] > COVERED
     pixels, wanted = known.pixels[covered], known.depth[covered]
     if not len(pixels):
         return 0.0, d_depth, d_alpha

@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from packuv.fit.depth import COVERED
 from packuv.fit.losses_cuda import compare
 from packuv.fit.options import LossOptions
 from packuv.fit.shots_cuda import ShotOnGpu
 from packuv.raster.cuda.render import OnGpu
-
-_COVERED = 0.5
-"""Alpha from which on a pixel's depth counts, as `depth.depth_loss`"""
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ def depth(seen: SeenOnGpu, options: LossOptions) -> PullOnGpu | None:
         return None
     (pixels, wanted), (_, drawn, alpha) = seen.shot.depths, seen.rendering.pictures
     share = alpha.reshape(-1)[pixels]
-    covered = share > _COVERED
+    covered = share > COVERED
     share = torch.where(covered, share, 1)
     mean = drawn.reshape(-1)[pixels] / share
     error = torch.where(covered, (mean - wanted) / seen.radius, 0)
