@@ -279,6 +279,7 @@ def _run(command: argparse.ArgumentParser, *, stop: bool) -> None:
     )
     _how(command, stop=stop)
     _direct(command)
+    command.add_argument("--preview", action="store_true", help="show what is fitted in the browser while it runs")
 
 
 def _plan(command: argparse.ArgumentParser) -> None:
@@ -592,7 +593,9 @@ def _report(command: argparse.ArgumentParser) -> None:
 
 
 def _view(command: argparse.ArgumentParser) -> None:
-    _scene(command)
+    command.add_argument(
+        "scene", type=Path, metavar="SCENE", help="scene file, or the folder of a run, also while it runs"
+    )
     command.add_argument("--port", type=int, default=8787, help="TCP port; 0 picks a free one")
     command.add_argument(
         "--capture", type=Path, metavar="DIR", help="lay what its cameras filmed beside (the run's, where it is known)"

@@ -25,6 +25,8 @@ from tasks.artefacts.retention import RUN
 from tasks.artefacts.store import try_lock
 
 RUNNING = ".running"
+FITTED = ("backdrop", "key", "segment")
+"""Stages whose artefacts can be looked at while a run goes on"""
 SAVE_SECONDS = 2.0
 """Least time between two notes of progress"""
 HEARTBEAT_SECONDS = 20.0
@@ -74,6 +76,8 @@ class RunRecord:
     """Stages that came to an end"""
     process: str = ""
     """Name of the process for all machines, see `tasks.artefacts.presence.own_name`"""
+    fitted: tuple[str, ...] = ()
+    """Artefacts of the fit so far, in the order in which they were made"""
 
     @property
     def here(self) -> bool:
@@ -116,6 +120,7 @@ class Register:
         self._record = record
         self._active: dict[str, Forecast] = {}
         self._ended = 0
+        self._fitted: list[str] = []
         self._saved = 0.0
         self._guard = threading.Lock()
         self.save()
@@ -133,6 +138,8 @@ class Register:
         with self._guard:
             self._active.pop(event.label, None)
             self._ended += 1
+            if event.key and event.key.stage in FITTED:
+                self._fitted.append(str(event.key))
         self.save()
 
     def told(self, label: str, text: str) -> None: ...
@@ -142,7 +149,8 @@ class Register:
         with self._guard, contextlib.suppress(OSError):
             self._saved = time.monotonic()
             stages = tuple(_moving(label, forecast) for label, forecast in self._active.items())
-            write_json(self._path, replace(self._record, updated=_now(), stages=stages, ended=self._ended))
+            now = replace(self._record, updated=_now(), stages=stages, ended=self._ended, fitted=tuple(self._fitted))
+            write_json(self._path, now)
 
     @contextlib.contextmanager
     def beating(self) -> Iterator[None]:
@@ -217,6 +225,11 @@ def find_runs(folder: Path) -> list[Found]:
             held = _held(path)
             found.append(Found(path, record, held or is_alive(_lock_of(path), record.process), held))
     return found
+
+
+def goes_on(folder: Path) -> bool:
+    """Whether a run is under way in the folder of a sequence."""
+    return any(run.alive for run in find_runs(folder))
 
 
 def _held(path: Path) -> bool:

@@ -28,6 +28,9 @@ from packuv.gaussians.segment import Segment
 from packuv.motion import MotionCache
 from packuv.progress import Progress, Ticks, no_progress
 
+TRACK = "track.json"
+"""Figures of the frames that are done; their list decides what counts"""
+
 
 def fit_segment(
     key: KeyState,
@@ -47,7 +50,7 @@ def fit_segment(
         raise ValueError(f"a segment starts at its keyframe, instant {key.instant}, not at {instants.start}")
     if key.still_bands:
         options = replace(options, rates=replace(options.rates, sh_rest=0.0))
-    track, backdrop = Track.resume(key, options, scratch), key.open_backdrop(options.device, views.budget)
+    track, backdrop = Track.resume(key, options.spare, scratch), key.open_backdrop(options.device, views.budget)
     ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
     for instant in instants[1 + len(track.frames) :]:
         views.forget()
@@ -104,6 +107,28 @@ def _fit_frame(
     return changed, figures if losses is None else {**figures, "loss": sum(losses.values()), "losses": dict(losses)}
 
 
+def done_so_far(scratch: Path) -> tuple[int, int] | None:
+    """Instant of the keyframe and number of frames, with that one, of a segment whose fit keeps its state in this
+    folder; None where no frame is done."""
+    try:
+        figures = json.loads((scratch / TRACK).read_text())["figures"]
+    except FileNotFoundError:
+        return None
+    return figures[0]["instant"] - 1, 1 + len(figures)
+
+
+def unfinished_segment(key: KeyState, scratch: Path) -> Segment:
+    """What is done of a segment whose fit keeps its state in this folder; `key` is its keyframe.
+
+    Raises FileNotFoundError where the fit goes on or ends meanwhile.
+    """
+    with open_npz(scratch / _frame_name(1)) as data:
+        spare = len(data["xyz"]) - len(key.foreground)
+    track = Track.resume(key, spare, scratch)
+    assert key.instant is not None, "a segment starts at a keyframe"
+    return track.segment(key.instant)
+
+
 class Track:
     """A segment while it is fitted: the model, and the codes and figures of the frames that are done; none of them
     holds the backdrop."""
@@ -118,12 +143,12 @@ class Track:
         self._changed = np.zeros(len(model), bool)
 
     @classmethod
-    def resume(cls, key: KeyState, options: FrameOptions, scratch: Path) -> Track:
-        """Where the last call was cut off, or at the keyframe."""
+    def resume(cls, key: KeyState, spare: int, scratch: Path) -> Track:
+        """Where the last call was cut off, or at the keyframe; with as many spare rows."""
         model = Model(key.foreground)
-        model.append(empty_gaussians(options.spare, key.bounds, sh_degree=key.quantizer.sh_degree))
+        model.append(empty_gaussians(spare, key.bounds, sh_degree=key.quantizer.sh_degree))
         track = cls(key, model, scratch)
-        path = scratch / "track.json"
+        path = scratch / TRACK
         if path.exists():
             track._load(json.loads(path.read_text())["figures"])
         return track
@@ -139,10 +164,10 @@ class Track:
         """Everything a later call needs. The list of frames is written last and decides what counts."""
         count = len(self.frames)
         codes = self.frames[-1]
-        save_npz(self._scratch / f"frame_{count:06d}.npz", {"xyz": codes.xyz, "attributes": codes.attributes})
+        save_npz(self._scratch / _frame_name(count), {"xyz": codes.xyz, "attributes": codes.attributes})
         state = {name: getattr(self.model.gaussians, name) for name in ATTRIBUTES}
         save_npz(self._scratch / f"state_{count:06d}.npz", {**state, "changed": self._changed})
-        save_json(self._scratch / "track.json", {"figures": self.figures})
+        save_json(self._scratch / TRACK, {"figures": self.figures})
         (self._scratch / f"state_{count - 1:06d}.npz").unlink(missing_ok=True)
 
     def segment(self, first: int) -> Segment:
@@ -170,6 +195,11 @@ class Track:
             self.model.overwrite(np.arange(len(self.model)), Gaussians(*(data[name] for name in ATTRIBUTES)))
             self._changed = data["changed"]
         for number in range(1, count + 1):
-            with open_npz(self._scratch / f"frame_{number:06d}.npz") as data:
+            with open_npz(self._scratch / _frame_name(number)) as data:
                 self.frames.append(Codes(data["xyz"], data["attributes"]))
         self.figures = figures
+
+
+def _frame_name(number: int) -> str:
+    """Of a frame's codes; the first after the keyframe has number 1."""
+    return f"frame_{number:06d}.npz"

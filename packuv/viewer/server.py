@@ -53,6 +53,9 @@ NUMBERED = re.compile(r"/(segments|frames|layers)/(0|[1-9][0-9]{0,8})\.bin")
 POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """Content security policy: a page that tries to reach another origin fails at once"""
 
+STATE = re.compile(r"(?:^|&)made=(\d+)(?:&|$)")
+"""In a query: the state of a growing scene that the page knows"""
+
 PATIENCE_SECONDS = 30
 """How long a connection may say nothing"""
 MOST_CONNECTIONS = 64
@@ -79,17 +82,37 @@ def serve(
     """
     if not 0 <= port < 2**16:
         raise ValueError(f"a port is a number from 0 to {2**16 - 1}, but is {port}")
-    with open_source(scene_path) as source, _server(host, port, source, worst, truth) as server:
-        announce(server.url) if announce else print(server.url, flush=True)
-        if open_browser:
-            webbrowser.open(server.url)
-        with suppress(KeyboardInterrupt):
-            server.serve_forever()
+    with open_source(scene_path) as source, bound(host, port, source, worst=worst, truth=truth) as server:
+        answer_until_interrupted(server, open_browser=open_browser, announce=announce)
 
 
-def _server(host: str, port: int, source: Source, worst: int | None, truth: Truth | None) -> ViewerServer:
+def answer_until_interrupted(
+    server: ViewerServer, *, open_browser: bool, announce: Callable[[str], object] | None = None
+) -> None:
+    """Serve until Ctrl-C; `announce` gets the address, by default it is printed."""
+    announce(server.url) if announce else print(server.url, flush=True)
+    if open_browser:
+        webbrowser.open(server.url)
+    with suppress(KeyboardInterrupt):
+        server.serve_forever()
+
+
+Grown = Callable[[], tuple[Source, Truth | None] | None]
+"""Gives what there is by now of something that grows; None where that is what it gave before"""
+
+
+def bound(
+    host: str,
+    port: int,
+    source: Source,
+    *,
+    worst: int | None = None,
+    truth: Truth | None = None,
+    grown: Grown | None = None,
+) -> ViewerServer:
+    """A server at this address; raises ValueError where that cannot be had."""
     try:
-        return ViewerServer((host, port), source, worst=worst, truth=truth)
+        return ViewerServer((host, port), source, worst=worst, truth=truth, grown=grown)
     except OSError as error:
         why, cure = error.strerror or str(error), "name another --port, or 0 for a free one"
         if error.errno not in (errno.EADDRINUSE, errno.EACCES):
@@ -104,10 +127,19 @@ class ViewerServer(ThreadingHTTPServer):
     request_queue_size = MOST_CONNECTIONS
 
     def __init__(
-        self, address: tuple[str, int], source: Source, *, worst: int | None = None, truth: Truth | None = None
+        self,
+        address: tuple[str, int],
+        source: Source,
+        *,
+        worst: int | None = None,
+        truth: Truth | None = None,
+        grown: Grown | None = None,
     ) -> None:
         super().__init__(address, _Handler)
         self.source, self.worst, self.truth = source, worst, truth
+        self.made = 0
+        """Counts the states of what grows"""
+        self._grown = grown
         self.reading = threading.Lock()  # decoders keep state
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.tables = lru_cache(maxsize=1)(lambda: tables_bytes(source.quantizer))
@@ -145,9 +177,11 @@ class ViewerServer(ThreadingHTTPServer):
             name, kind = PAGES[path]
             return Path(__file__).with_name(name).read_bytes(), kind
         if path == "/scene.json":
+            self._look_again()
+            growing = {"made": self.made} if self._grown else {}
             marked = {} if self.worst is None else {"worst": self.worst}
             filmed = {"truth": list(self.truth.cameras)} if self.truth else {}
-            told = {**describe(self.source), **marked, **filmed, "layers": UvOptions.layers}
+            told = {**describe(self.source), **marked, **filmed, **growing, "layers": UvOptions.layers}
             return json.dumps(told).encode(), "application/json"
         if path == "/tables.bin":
             return self.tables(), BINARY
@@ -155,6 +189,16 @@ class ViewerServer(ThreadingHTTPServer):
             return self._filmed(unquote(asked[1]), int(asked[2]))
         numbered = NUMBERED.fullmatch(path)
         return self._numbered(numbered[1], int(numbered[2])) if numbered else None
+
+    def _look_again(self) -> None:
+        with self.reading:
+            if self._grown and (now := self._grown()):
+                (self.source, self.truth), self.made = now, self.made + 1
+
+    def is_past(self, query: str) -> bool:
+        """Whether a page asks for something of a state that is over: frames had other numbers."""
+        known = STATE.search(query)
+        return bool(self._grown and known and int(known[1]) != self.made)
 
     def _filmed(self, camera: str, frame: int) -> tuple[bytes, str] | None:
         if not self.truth or camera not in self.truth.cameras or frame >= self.source.segments[-1].stop:
@@ -194,7 +238,9 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, *, with_body: bool) -> None:
         if self._is_rebound():
             return self._send(HTTPStatus.FORBIDDEN, b"this viewer answers to localhost only\n", "text/plain", with_body)
-        path, started = self.path.partition("?")[0], time.perf_counter()
+        (path, _, query), started = self.path.partition("?"), time.perf_counter()
+        if self.server.is_past(query):
+            return self._send(HTTPStatus.GONE, b"there is more by now\n", "text/plain", with_body)
         try:
             found = self.server.content(path)
         except Exception as error:  # a damaged file must reach the page as words, not as a dropped connection

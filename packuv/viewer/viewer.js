@@ -6,6 +6,7 @@ import { Navigation, frusta, worldOf } from "./navigation.js";
 const VIEW_SECONDS = 2; // of a camera path, from view to view at least
 const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
 const STALL_NOTICE_MS = 250;
+const LOOK_MS = 5000, IDLE_MS = 10000; // between looks at whether there is more of what grows; without a touch
 const HERE = 1, LOST = 2; // what the worker says of a frame; 0 is on its way
 const GAMMA = 2.4; // a factor on light is its power of 1 / 2.4 on sRGB + 0.055
 
@@ -27,6 +28,7 @@ const ruler = { on: false, points: [] }; // world
 const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
 const meter = { drawn: 0, frames: 0, since: performance.now(), sort_ms: 0, count: 0, moving: 0, seen: new Set() };
 let scene = null, world = null, frameCount = 0, rate = 30, keyframes = new Set();
+let touched = -IDLE_MS; // when somebody last did something
 let waiting = false, stale = true, dirty = true, spare = null, previous = performance.now();
 
 let splats;
@@ -34,6 +36,10 @@ const navigation = new Navigation(canvas, () => { stale = dirty = true; });
 const worker = new Worker("worker.js");
 worker.onmessage = ({ data }) => receive[data.type](data);
 worker.onerror = (event) => notice(`The worker stopped: ${event.message}`, true);
+
+for (const kind of ["pointerdown", "pointermove", "wheel", "keydown"]) {
+  addEventListener(kind, () => { touched = performance.now(); }, { passive: true });
+}
 
 // ---- messages
 
@@ -48,6 +54,7 @@ const receive = {
     navigation.setWorld(world);
     splats.setLines(frusta(scene, world));
     fillPage();
+    if (scene.made !== undefined) setTimeout(lookForMore, LOOK_MS);
     requestAnimationFrame(tick);
   },
   buffered({ map, ahead }) {
@@ -497,16 +504,31 @@ function spanText() {
   return `${span.toPrecision(4)} ${scene.metric ? "m" : "units"}`;
 }
 
+// ---- what grows: a run that is under way
+
+// Ask now and then, but not while somebody is at it, and come back to the same view where there is more.
+async function lookForMore() {
+  const idle = performance.now() - touched > IDLE_MS;
+  const now = idle ? await fetch("scene.json").then((answer) => answer.json(), () => null) : null;
+  if (!now || now.made === scene.made) return setTimeout(lookForMore, LOOK_MS);
+  putHere(Number(player.playing));
+  location.reload();
+}
+
 // ---- what is kept
 
-function linkHere() {
-  const now = new URLSearchParams({ frame: player.shown, play: 0, mode: look.mode, scale: look.scale, bands: look.bands });
+function putHere(play) {
+  const now = new URLSearchParams({ frame: player.shown, play, mode: look.mode, scale: look.scale, bands: look.bands });
   const numbers = navigation.numbers().map((value) => Number(value.toPrecision(9)));
   now.set(...(navigation.exact ? ["camera", navigation.exact] : ["view", numbers.join(",")]));
   now.set("background", look.background.join(","));
   if (look.lines) now.set("cameras", 1);
   if (truth.mode) now.set("truth", truth.mode);
   history.replaceState(null, "", `#${now}`);
+}
+
+function linkHere() {
+  putHere(0);
   const told = () => notice("This page's address now shows this very view.");
   if (!navigator.clipboard) return told();
   navigator.clipboard.writeText(location.href).then(() => notice("The link to this view is copied."), told);

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.commands.output import answer
+from pipelines.commands.preview import previewing
 from pipelines.commands.progress import TerminalProgress
 from pipelines.events import Journal
 from pipelines.request import PRESETS, STAGES, RunRequest, read_settings
@@ -30,8 +31,10 @@ def command(arguments: argparse.Namespace) -> int:
     """`packuv run` and the commands for its first stages."""
     request = request_from(arguments)
     progress = TerminalProgress(sys.stderr if arguments.json else sys.stdout)
-    with contextlib.closing(progress):
-        outcome = run(request, Journal(progress), direct=arguments.direct)
+    journal = Journal(progress)
+    shown = previewing(request, journal) if arguments.preview else contextlib.nullcontext()
+    with contextlib.closing(progress), shown:
+        outcome = run(request, journal, direct=arguments.direct)
     if request.stop_after == STAGES[-1]:
         from pipelines.results import check_whole  # takes seconds, as what runs
 

@@ -311,21 +311,45 @@ def _score_text(means: Mapping[str, float | None], kind: str) -> str:
 
 def view(arguments: argparse.Namespace) -> int:
     """`packuv view`: until Ctrl-C."""
-    from packuv.scene import open_scene
-    from packuv.viewer import serve
     from packuv.viewer.server import LOOPBACK
+    from pipelines.commands.preview import view_run
+    from pipelines.register import goes_on
+    from tasks.stages.encode import SCENE
 
-    folder = arguments.scene.parent
-    worst, capture = _worst_frame(folder), arguments.capture or _capture_of(folder)
-    if capture and not capture.is_dir():
+    if (capture := arguments.capture) and not capture.is_dir():
         raise FileNotFoundError(f"no capture folder {capture}; name the one that the scene was made from, or none")
     if arguments.host not in LOOPBACK:
         told = f"packuv: everyone who can reach {arguments.host} sees this scene, without a password; end with Ctrl-C"
         print(told, file=sys.stderr)
-    with open_scene(arguments.scene) as scene:
-        truth = Filmed(scene.header, capture) if capture else None
-    serve(arguments.scene, host=arguments.host, port=arguments.port, open_browser=True, worst=worst, truth=truth)
+    if not arguments.scene.is_dir():
+        _view_scene(arguments.scene, arguments)
+        return 0
+    folder = _sequence_in(arguments.scene)
+    if (folder / SCENE).exists() and not goes_on(folder):
+        _view_scene(folder / SCENE, arguments)
+    else:
+        view_run(folder, arguments.capture or _capture_of(folder), arguments.host, arguments.port)
     return 0
+
+
+def _view_scene(path: Path, arguments: argparse.Namespace) -> None:
+    from packuv.scene import open_scene
+    from packuv.viewer import serve
+
+    worst, capture = _worst_frame(path.parent), arguments.capture or _capture_of(path.parent)
+    with open_scene(path) as scene:
+        truth = Filmed(scene.header, capture) if capture else None
+    serve(path, host=arguments.host, port=arguments.port, open_browser=True, worst=worst, truth=truth)
+
+
+def _sequence_in(folder: Path) -> Path:
+    """The folder of the one sequence that a run's --out holds, or this is; raises ValueError for several."""
+    from pipelines.commands.watch import sequence_folders
+
+    found = sequence_folders(folder)
+    if len(found) > 1:
+        raise ValueError(f"{folder} holds {len(found)} sequences, {', '.join(path.name for path in found)}; name one")
+    return found[0]
 
 
 class Filmed:

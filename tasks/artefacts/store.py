@@ -36,7 +36,7 @@ from tasks.artefacts.presence import Beat, LostError, is_alive, is_ended, is_nam
 from tasks.artefacts.recipe import naming, write_json
 
 RECEIPT = "receipt.json"
-WORK, OUT = ".work", "out"
+WORK, OUT, SCRATCH = ".work", "out", "scratch"
 BUILT, BEGUN = "built.json", "begun.json"
 IN_USE, GONE = "in_use.lock", "gone-"
 PRESENT, RUNS, CLEANS = ".in_use", "run-", "clean-"
@@ -512,7 +512,7 @@ def _empty(place: Path) -> None:
 
 def _attempt(place: Path, build: Build, lock: int, check: Callable[[], None]) -> None:
     """Do the work, unless it was done and the run killed while its files were read for the receipt."""
-    out, scratch = place / OUT, place / "scratch"
+    out, scratch = place / OUT, place / SCRATCH
     if (place / BUILT).exists():
         return
     shutil.rmtree(out, ignore_errors=True)
