@@ -46,10 +46,10 @@ async function open() {
 }
 
 // Where something lies; of what grows, in the state that this page knows.
-function place(path) { return scene?.made === undefined ? path : `${path}?made=${scene.made}`; }
+function addressOf(path) { return scene?.made === undefined ? path : `${path}?made=${scene.made}`; }
 
 async function get(path, signal) {
-  const answer = await fetch(place(path), { signal });
+  const answer = await fetch(addressOf(path), { signal });
   if (answer.ok) return answer;
   const text = (await answer.text()).trim() || `${path}: ${answer.status}`;
   throw NEVER.has(answer.status) ? new LostError(text) : new Error(text);
@@ -63,7 +63,7 @@ const traffic = { bytes: 0, decode_ms: 0, unpack_ms: 0 }; // since the page was 
 
 // What a body took on its way, by the browser's own record, and the server by its word.
 function tally(path) {
-  const record = performance.getEntriesByName(new URL(place(path), location.href).href).at(-1);
+  const record = performance.getEntriesByName(new URL(addressOf(path), location.href).href).at(-1);
   traffic.bytes += record?.transferSize ?? 0;
   traffic.decode_ms = record?.serverTiming?.find(({ name }) => name === "decode")?.duration ?? 0;
   performance.clearResourceTimings();
