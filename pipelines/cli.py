@@ -112,15 +112,20 @@ def _outcome(words: Sequence[str]) -> int:
     except BAD_INPUT as error:
         return _say(WRONG, _system_message(error, arguments) if isinstance(error, OSError) else error)
     except KeyboardInterrupt:
-        return _say(INTERRUPTED, "stopped; the same command goes on from here")
+        return _say(INTERRUPTED, f"stopped; {_afterwards(arguments)}")
     except Terminated as signal:
-        return _say(signal.code, f"ended by {signal}; the same command goes on from here")
+        return _say(signal.code, f"ended by {signal}; {_afterwards(arguments)}")
     except CancelledError as error:
         return _say(FAILED, error)
     except OSError as error:  # a full disk, a lost network: the system's fault, and its message says all
         return _say(WRONG if error.errno in WRONG_PATH else FAILED, _system_message(error, arguments))
     except Exception as error:
         return _say(FAILED, f"{_first_sentence(error)}; {_log_of(error)}")
+
+
+def _afterwards(arguments: argparse.Namespace) -> str:
+    """What the same command would do after it was stopped."""
+    return f"the same command {'goes on from here' if hasattr(arguments, 'preset') else 'begins anew'}"
 
 
 def _parsed(words: Sequence[str]) -> argparse.Namespace:

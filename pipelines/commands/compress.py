@@ -4,24 +4,33 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from packuv.partial import partial_path
 from pipelines.commands.terminal import print_facts, shown
 from pipelines.disk import size_text
+
+if TYPE_CHECKING:
+    from packuv.compress import Compressed, Goal
+
+SEARCHES = 4
+"""Of which each aims at less than the one before, where footage shows a loss above what was asked for"""
+SHORT = 0.97
+"""Share of what a proportion would allow at which such a search aims"""
 
 
 def command(arguments: argparse.Namespace) -> int:
     """Exit code 2 where the goal is out of reach; then nothing is written."""
-    from packuv.compress import Goal, compress
+    from packuv.compress import Goal
 
     filmed = _scores(arguments, arguments.scene) if arguments.capture else None
     fitted = {"fitted_db": filmed["psnr_db"]} if filmed else {}
     if arguments.fitted_db is not None:
         fitted = {"fitted_db": arguments.fitted_db}
     goal = Goal(arguments.ratio, arguments.loss_db, **fitted)
-    with shown(arguments, "compress") as progress:
-        found = compress(arguments.scene, arguments.output, goal, seed=arguments.seed, progress=progress)
+    found, scores = _search(arguments, goal, filmed)
     facts: dict[str, Any] = {
         "file": str(arguments.output),
         "bytes": found.bytes,
@@ -36,9 +45,42 @@ def command(arguments: argparse.Namespace) -> int:
         "attribute_steps": found.steps.attribute.tolist(),
     }
     if filmed:
-        facts["filmed"] = {"lossless": filmed, "compressed": _scores(arguments, arguments.output)}
+        facts["filmed"] = {"lossless": filmed, "compressed": scores}
     print_facts(facts, arguments.json, _text)
     return 0
+
+
+def _search(
+    arguments: argparse.Namespace, goal: Goal, filmed: Mapping[str, float] | None
+) -> tuple[Compressed, dict[str, float] | None]:
+    """Compress; with footage, so that the loss which it shows is what was asked for at most. Also scores of the result.
+
+    Raises ValueError where no search reaches that; then nothing is written.
+    """
+    from packuv.compress import compress
+
+    asked, lost, place = goal.loss_db, 0.0, partial_path(arguments.output, ".mkv")
+    try:
+        for number in range(SEARCHES):
+            try:
+                with shown(arguments, "compress") as progress:
+                    found = compress(arguments.scene, place, goal, seed=arguments.seed, progress=progress)
+            except ValueError:
+                if number:  # no steps are so fine
+                    break
+                raise
+            scores = _scores(arguments, place) if filmed else None
+            lost = filmed["psnr_db"] - scores["psnr_db"] if filmed and scores else 0.0
+            if asked is None or goal.loss_db is None or lost <= asked:
+                place.replace(arguments.output)
+                return found, scores
+            goal = replace(goal, loss_db=SHORT * goal.loss_db * asked / lost)
+    finally:
+        place.unlink(missing_ok=True)
+    raise ValueError(
+        f"the loss must be at most {asked:g} dB, but footage shows {lost:.3f} dB with the finest steps tried; "
+        "ask for more decibels, or for a --ratio"
+    )
 
 
 def _scores(arguments: argparse.Namespace, scene: Path) -> dict[str, float]:

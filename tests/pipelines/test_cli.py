@@ -104,7 +104,7 @@ ROOM = r"/\S+: [\d.,]+ .?B are free; free some and run the same command again"
         (ValueError("the video ends early"), WRONG, r"packuv: the video ends early\n"),
         (FileNotFoundError("no video cam03.mp4"), WRONG, r"packuv: no video cam03\.mp4\n"),
         (PermissionError(13, "Permission denied", "runs"), WRONG, r"packuv: Permission denied: runs\n"),
-        (KeyboardInterrupt(), INTERRUPTED, r"packuv: stopped; the same command goes on from here\n"),
+        (KeyboardInterrupt(), INTERRUPTED, r"packuv: stopped; the same command begins anew\n"),
         (TypeError("a bug\nin two lines"), FAILED, r"packuv: a bug in two lines; the traceback is in (\S+)\n"),
         (OSError(28, "No space left on device"), FAILED, rf"packuv: No space left on device: {ROOM}\n"),
         (OSError(122, "Disk quota exceeded", "a.mp4"), FAILED, rf"packuv: Disk quota exceeded: {ROOM}\n"),
@@ -129,6 +129,16 @@ def test_every_failure_is_one_line_and_a_code(error, code, message, capsys, monk
         log = next(tmp_path.iterdir())
         assert str(log) == found[1]
         assert "Traceback" in log.read_text()
+
+
+@pytest.mark.parametrize("words", [["run", "capture", "--out", "runs"], ["fit", "capture", "--out", "runs"]])
+def test_what_keeps_its_stages_goes_on_after_a_stop(words, capsys, monkeypatch):
+    def stops(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_load", lambda name: stops)
+    assert main(words) == INTERRUPTED
+    assert capsys.readouterr().err == "packuv: stopped; the same command goes on from here\n"
 
 
 def test_a_full_disk_takes_no_traceback_either(capsys, monkeypatch):

@@ -28,7 +28,7 @@ def work(arguments):
         print("written", flush=True)
 
 cli._load = lambda name: work
-sys.exit(cli.main(["doctor"]))
+sys.exit(cli.main(["run", "capture", "--out", "runs"]))
 """
 
 

@@ -6,7 +6,9 @@ import json
 
 import pytest
 
+from packuv.scene import open_scene
 from pipelines.cli import main
+from pipelines.commands import compress
 from tests.support.small_scene import small_scene
 
 
@@ -39,3 +41,26 @@ def test_goals_that_cannot_be_are_refused(lossless, tmp_path, goal, capsys):
     assert main(["compress", str(lossless), *goal, "-o", str(tmp_path / "small.mkv")]) == 2
     assert len(capsys.readouterr().err.splitlines()[-1]) > 20
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("factor", "code"), [(1.3, 0), (1e6, 2)])
+def test_the_loss_that_footage_shows_is_what_was_asked_for_at_most(
+    lossless, tmp_path, factor, code, capsys, monkeypatch
+):
+    def scores(arguments, scene):
+        """Footage that shows a loss larger by a factor than the header reckons."""
+        with open_scene(scene) as opened:
+            said = opened.header.extra.get("compression", {"loss_db": 0.0})
+        return {"psnr_db": 30 - factor * said["loss_db"], "ssim": 0.9}
+
+    monkeypatch.setattr(compress, "_scores", scores)
+    small = tmp_path / "small.mkv"
+    words = ["compress", str(lossless), "--loss-db", "0.5", "--capture", str(tmp_path), "-o", str(small), "--json"]
+    assert main(words) == code
+    said = capsys.readouterr()
+    if code:
+        assert "at most 0.5 dB, but footage shows" in said.err
+        assert not list(tmp_path.iterdir())
+    else:
+        filmed = json.loads(said.out)["filmed"]
+        assert 0.4 < filmed["lossless"]["psnr_db"] - filmed["compressed"]["psnr_db"] <= 0.5
