@@ -16,7 +16,7 @@ import webbrowser
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -25,17 +25,8 @@ from urllib.parse import unquote
 
 import cv2
 
-from packuv.gaussians.uvsize import UvOptions
-from packuv.viewer.source import (
-    Source,
-    Truth,
-    describe,
-    frame_bytes,
-    key_bytes,
-    layer_bytes,
-    open_source,
-    tables_bytes,
-)
+from packuv.viewer.bodies import Bodies
+from packuv.viewer.source import Source, Truth, describe, open_source
 
 PAGES = {
     "/": ("page.html", "text/html; charset=utf-8"),
@@ -46,9 +37,9 @@ PAGES = {
 }
 """Path to file beside this module and its type; nothing else on disk is reachable"""
 
-BINARY = "application/octet-stream"
+BINARY, JSON = "application/octet-stream", "application/json"
 PICTURE = re.compile(r"/truth/([^/]{1,600})/(0|[1-9][0-9]{0,8})\.png")
-NUMBERED = re.compile(r"/(segments|frames|layers)/(0|[1-9][0-9]{0,8})\.bin")
+NUMBERED = re.compile(r"/(segments|frames|layers)/(0|[1-9][0-9]{0,8})(?:/(0|[1-9][0-9]{0,3}))?\.bin")
 
 POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """Content security policy: a page that tries to reach another origin fails at once"""
@@ -107,10 +98,8 @@ class ViewerServer(ThreadingHTTPServer):
         self, address: tuple[str, int], source: Source, *, worst: int | None = None, truth: Truth | None = None
     ) -> None:
         super().__init__(address, _Handler)
-        self.source, self.worst, self.truth = source, worst, truth
-        self.reading = threading.Lock()  # decoders keep state
+        self.source, self.worst, self.truth, self.bodies = source, worst, truth, Bodies(source)
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        self.tables = lru_cache(maxsize=1)(lambda: tables_bytes(source.quantizer))
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Hang up on a caller too many."""
@@ -139,39 +128,54 @@ class ViewerServer(ThreadingHTTPServer):
     def is_loopback(self) -> bool:
         return self.server_address[0] in ("127.0.0.1", "::1")
 
-    def content(self, path: str) -> tuple[bytes, str] | None:
-        """Body and type of a path without its query; None where there is nothing."""
+    def content(self, path: str) -> Content | None:
+        """What a path without its query holds; None where there is nothing."""
         if path in PAGES:
             name, kind = PAGES[path]
-            return Path(__file__).with_name(name).read_bytes(), kind
+            return Content(_deflated(Path(__file__).with_name(name).read_bytes()), kind)
         if path == "/scene.json":
             marked = {} if self.worst is None else {"worst": self.worst}
             filmed = {"truth": list(self.truth.cameras)} if self.truth else {}
-            told = {**describe(self.source), **marked, **filmed, "layers": UvOptions.layers}
-            return json.dumps(told).encode(), "application/json"
-        if path == "/tables.bin":
-            return self.tables(), BINARY
+            return Content(_deflated(json.dumps({**describe(self.source), **marked, **filmed}).encode()), JSON)
         if asked := PICTURE.fullmatch(path):
             return self._filmed(unquote(asked[1]), int(asked[2]))
-        numbered = NUMBERED.fullmatch(path)
-        return self._numbered(numbered[1], int(numbered[2])) if numbered else None
+        if numbered := NUMBERED.fullmatch(path):
+            return self._numbered(numbered[1], *(int(number) for number in numbered.groups()[1:] if number))
+        return None
 
-    def _filmed(self, camera: str, frame: int) -> tuple[bytes, str] | None:
+    def _filmed(self, camera: str, frame: int) -> Content | None:
         if not self.truth or camera not in self.truth.cameras or frame >= self.source.segments[-1].stop:
             return None
         pixels = self.truth.picture(camera, frame)
         if pixels is None:
             return None
         written = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-        return written.tobytes(), "image/png"
+        return Content(_deflated(written.tobytes()), "image/png")
 
-    def _numbered(self, what: str, number: int) -> tuple[bytes, str] | None:
-        build = {"segments": key_bytes, "frames": frame_bytes, "layers": layer_bytes}[what]
+    def _numbered(self, what: str, *numbers: int) -> Content | None:
+        bodies = self.bodies
+        made: dict[tuple[str, int], Callable[..., bytes]] = {
+            ("segments", 2): bodies.part,
+            ("frames", 1): bodies.frame,
+            ("layers", 1): bodies.layers,
+        }
+        make = made.get((what, len(numbers)))
         try:
-            with self.reading:
-                return build(self.source, number), BINARY
+            return Content(make(*numbers), BINARY) if make else None
         except IndexError:
             return None
+
+
+@dataclass(frozen=True)
+class Content:
+    """What an address holds."""
+
+    deflated: bytes
+    kind: str
+
+
+def _deflated(content: bytes) -> bytes:
+    return zlib.compress(content, 6)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -205,22 +209,21 @@ class _Handler(BaseHTTPRequestHandler):
         if found is None:
             return self._send(HTTPStatus.NOT_FOUND, b"nothing here\n", "text/plain; charset=utf-8", with_body)
         self._decode_ms = 1000 * (time.perf_counter() - started)
-        self._send(HTTPStatus.OK, *found, with_body)
+        if "deflate" in self.headers.get("Accept-Encoding", ""):
+            return self._send(HTTPStatus.OK, found.deflated, found.kind, with_body, encoding="deflate")
+        self._send(HTTPStatus.OK, zlib.decompress(found.deflated), found.kind, with_body)
 
     def _is_rebound(self) -> bool:
         """True if a name of another site was made to point here: its page must not read the scene."""
         host = re.sub(r":\d+$", "", self.headers.get("Host", "localhost"))
         return self.server.is_loopback and host not in LOOPBACK
 
-    def _send(self, status: HTTPStatus, body: bytes, kind: str, with_body: bool) -> None:
-        deflate = "deflate" in self.headers.get("Accept-Encoding", "")
-        if deflate:
-            body = zlib.compress(body, 1)
+    def _send(self, status: HTTPStatus, body: bytes, kind: str, with_body: bool, *, encoding: str = "") -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
-        if deflate:
-            self.send_header("Content-Encoding", "deflate")
+        if encoding:
+            self.send_header("Content-Encoding", encoding)
         if self._decode_ms is not None:
             self.send_header("Server-Timing", f"decode;dur={self._decode_ms:.1f}")
         self.send_header("Vary", "Accept-Encoding")

@@ -13,7 +13,7 @@ const at = (id) => document.getElementById(id);
 const canvas = at("picture");
 const wish = new URLSearchParams(location.hash.slice(1)); // frame, camera, mode, play=0, scale, background, bare=1
 
-const look = { mode: "colour", bands: 15, scale: 1, background: [0, 0, 0], range: [1, 2], light: [1, 1, 1], lines: false };
+const look = { mode: "colour", bands: 15, arrived: 15, scale: 1, background: [0, 0, 0], range: [1, 2], light: [1, 1, 1], lines: false };
 const player = {
   frame: 0, step: 1, ends: "loop", shown: -1, playing: wish.get("play") !== "0", speed: 1, due: 0,
   stalled: false, stalledAt: 0, stalls: 0,
@@ -60,6 +60,9 @@ const receive = {
     document.documentElement.dataset.layers = segment; // for automation
     dirty = true;
   },
+  part() { // of a key; the page asks for it as long as nothing whole is on screen
+    if (player.shown < 0) stale = true;
+  },
   miss() { waiting = false; stale = false; },
   picture(message) {
     waiting = false;
@@ -72,8 +75,11 @@ const receive = {
     settleRange(message.range, message.frame !== player.shown && player.shown >= 0);
     if (message.frame !== player.shown) meter.frames++;
     player.shown = message.frame;
-    look.light = (scene.light?.[message.frame] ?? [0, 0, 0]).map((log) => Math.exp(log / GAMMA));
+    look.arrived = message.bands;
+    const lit = message.frame < 0 ? scene.segments[message.segment].first : message.frame;
+    look.light = (scene.light?.[lit] ?? [0, 0, 0]).map((log) => Math.exp(log / GAMMA));
     const { count, moving, sort_ms, visible, traffic } = message;
+    if (visible) document.documentElement.dataset.first ??= performance.now(); // for automation: ms to a picture
     Object.assign(meter, { count, moving, sort_ms, visible, traffic });
     dirty = true;
   },
@@ -204,7 +210,7 @@ function drawPicture() {
   dirty = false;
   const view = navigation.view();
   const started = performance.now();
-  splats.draw(view, look);
+  splats.draw(view, { ...look, bands: look.bands & look.arrived });
   meter.submit_ms = performance.now() - started;
   meter.drawn++;
   drawRuler();
