@@ -8,7 +8,6 @@ others and damage stays where it is. docs/viewer.md gives the layout byte by byt
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -180,8 +179,8 @@ class Bodies:
         return np.concatenate([NO_ROWS, *(_along_curve(key, turn) for turn in turns)])
 
     def _part_count(self, plan: KeyRows) -> int:
-        still = plan.own[1]
-        return 1 + math.ceil((still.stop - still.start) / PART_ROWS) + self.source.quantizer.sh_degree
+        still, degree = plan.own[1], self.source.quantizer.sh_degree
+        return 1 + degree + len(range(still.start, still.stop, PART_ROWS))
 
     def _part(self, segment: int, number: int) -> bytes:
         plan = self._plan(segment)

@@ -85,7 +85,7 @@ def read_columns(
         xyz[:, axis] = _summed(folded >> 1 ^ -(folded & 1), int(filters[axis]))
     for number in range(columns):
         attributes[:, number] = _summed(planes[2 * axes + number], int(filters[axes + number]))
-    for number in np.flatnonzero(filters[axes:] & GREEN):
+    for number in np.flatnonzero(filters[axes:] & GREEN).tolist():
         attributes[:, number] += attributes[:, number - (number - colours) % 3 + 1]
     return xyz, attributes
 

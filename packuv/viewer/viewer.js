@@ -48,6 +48,7 @@ const receive = {
     navigation.setWorld(world);
     splats.setLines(frusta(scene, world));
     fillPage();
+    document.documentElement.dataset.stalls = 0; // for automation
     requestAnimationFrame(tick);
   },
   buffered({ map, ahead }) {
@@ -157,7 +158,7 @@ function following({ frame, step }) { // frame and direction; null at the end
 
 function stall() {
   player.stalled = true;
-  player.stalls++;
+  document.documentElement.dataset.stalls = ++player.stalls; // for automation
   player.stalledAt = performance.now();
   player.due = 0;
   tellPlayhead();
