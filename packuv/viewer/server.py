@@ -182,6 +182,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: ViewerServer
     timeout = PATIENCE_SECONDS
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # a body must not wait until its head is acknowledged
     server_version = "packuv"
     _decode_ms: float | None = None
     """That the answer took to be found"""

@@ -16,7 +16,7 @@ const wish = new URLSearchParams(location.hash.slice(1)); // frame, camera, mode
 const look = { mode: "colour", bands: 15, arrived: 15, scale: 1, background: [0, 0, 0], range: [1, 2], light: [1, 1, 1], lines: false };
 const player = {
   frame: 0, step: 1, ends: "loop", shown: -1, playing: wish.get("play") !== "0", speed: 1, due: 0,
-  stalled: false, stalledAt: 0, stalls: 0,
+  stalled: false, stalledAt: 0, stalls: 0, overtaken: 0, // frames whose time was over before they were drawn
 };
 const ENDS = { loop: "Loop", bounce: "Ping-pong", stop: "Once" }; // what happens at the last frame
 const TRUTHS = ["", "beside", "over", "minus"];
@@ -52,8 +52,7 @@ const receive = {
     requestAnimationFrame(tick);
   },
   buffered({ map, ahead }) {
-    Object.assign(buffer, { map, ahead });
-    drawMarks();
+    Object.assign(buffer, { map, ahead, fresh: true });
   },
   layers({ segment, layers }) {
     if (segment !== layered.shown) return;
@@ -138,9 +137,11 @@ function advance(seconds) {
     if (player.due < shownFor(player.frame)) break;
     if (!buffer.map[next.frame]) { stall(); break; }
     player.due -= shownFor(player.frame);
+    if (player.frame !== player.shown && buffer.map[player.frame] === HERE) player.overtaken++;
     Object.assign(player, next);
   }
   if (moved) { stale = true; tellPlayhead(); showClock(); }
+  document.documentElement.dataset.overtaken = player.overtaken; // for automation
 }
 
 function shownFor(frame) { // seconds; frames need not be evenly spaced
@@ -204,6 +205,7 @@ function tick(now) {
   if (player.playing && !scrubbing) advance(seconds);
   if (!waiting && (stale || player.frame !== player.shown && buffer.map[player.frame] === HERE)) ask();
   if (dirty) drawPicture();
+  if (buffer.fresh) drawMarks();
   if (now - meter.since > 1000) showSpeeds(now);
 }
 
@@ -281,15 +283,17 @@ function setTruth(mode) {
 
 function drawMarks() {
   const marks = at("marks"), pen = marks.getContext("2d");
+  buffer.fresh = false;
   marks.width = Math.max(1, marks.clientWidth);
   const step = marks.width / frameCount;
   pen.fillStyle = "#ffffff1c";
   pen.fillRect(0, 0, marks.width, 10);
   pen.fillStyle = "#6cb2ff66";
-  for (let first = 0, frame = 0; frame <= frameCount; frame++) { // runs: single frames would leave seams
-    if (buffer.map[frame]) continue;
+  for (let frame = 0; frame < frameCount; frame++) { // runs: single frames would leave seams
+    if (!buffer.map[frame]) continue;
+    const first = frame;
+    while (buffer.map[frame]) frame++;
     pen.fillRect(first * step, 0, (frame - first) * step, 10);
-    first = frame + 1;
   }
   pen.fillStyle = "#ff6b6b";
   for (let frame = 0; frame < frameCount; frame++) {
@@ -333,6 +337,7 @@ function showStats(drawn, seconds) {
     "drawn": drawn, "Gaussians drawn": visible.toLocaleString("en"), "decode, server": ms(traffic.decode_ms),
     "unpack": ms(traffic.unpack_ms), "sort": ms(meter.sort_ms), "draw, processor": ms(meter.submit_ms),
     "draw, GPU": splats.gpu_ms === null ? "not told" : ms(splats.gpu_ms), "stalls": player.stalls,
+    "too slow to draw": player.overtaken,
     "received": `${((traffic.bytes ?? 0) / 1e6).toFixed(2)} MB`, "network": `${(rate_kb || 0).toFixed(0)} kB/s`,
     "picture": `${canvas.width} × ${canvas.height}`,
   };
