@@ -85,7 +85,7 @@ def _write_json(path: Path, content: Any) -> None:
 def _write_page(folder: Path) -> None:
     """The viewer as it is, but for the worker, which finds its data through the index."""
     viewer = files("packuv.viewer")
-    for name in ("viewer.js", "splats.js", "navigation.js"):
+    for name in ("viewer.js", "splats.js", "navigation.js", "film.js"):
         (folder / name).write_text((viewer / name).read_text())
     (folder / "index.html").write_text((viewer / "page.html").read_text())
     (folder / "worker.js").write_text((viewer / "packed.js").read_text() + (viewer / "worker.js").read_text())

@@ -33,6 +33,7 @@ PAGES = {
     "/viewer.js": ("viewer.js", "text/javascript; charset=utf-8"),
     "/splats.js": ("splats.js", "text/javascript; charset=utf-8"),
     "/navigation.js": ("navigation.js", "text/javascript; charset=utf-8"),
+    "/film.js": ("film.js", "text/javascript; charset=utf-8"),
     "/worker.js": ("worker.js", "text/javascript; charset=utf-8"),
 }
 """Path to file beside this module and its type; nothing else on disk is reachable"""

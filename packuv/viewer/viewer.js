@@ -2,6 +2,7 @@
 
 import { DEPTH_STOPS, MODES, SplatView } from "./splats.js";
 import { Navigation, frusta, worldOf } from "./navigation.js";
+import { Recorder, momentOf } from "./film.js";
 
 const VIEW_SECONDS = 2; // of a camera path, from view to view at least
 const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
@@ -22,6 +23,7 @@ const ENDS = { loop: "Loop", bounce: "Ping-pong", stop: "Once" }; // what happen
 const TRUTHS = ["", "beside", "over", "minus"];
 const truth = { mode: "", loading: "", shown: "" }; // addresses of pictures
 const path = []; // views of a camera path, as packuv.film reads them
+const filming = { on: false, stopped: false, told: null }; // told: hears that a picture has come
 const layered = { shown: -1, asked: -1 }; // segments
 const ruler = { on: false, points: [] }; // world
 const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
@@ -63,7 +65,7 @@ const receive = {
   part() { // of a key; the page asks for it as long as nothing whole is on screen
     if (player.shown < 0) stale = true;
   },
-  miss() { waiting = false; stale = false; },
+  miss() { waiting = false; stale = false; filming.told?.(); },
   picture(message) {
     waiting = false;
     if (message.key) splats.setKey(message.key.packed, message.key.slotCount, message.moving);
@@ -82,6 +84,7 @@ const receive = {
     if (visible) document.documentElement.dataset.first ??= performance.now(); // for automation: ms to a picture
     Object.assign(meter, { count, moving, sort_ms, visible, traffic });
     dirty = true;
+    filming.told?.();
   },
   lost({ count, text }) {
     at("lost").hidden = false;
@@ -200,6 +203,7 @@ function tick(now) {
   requestAnimationFrame(tick);
   const seconds = Math.min(0.25, (now - previous) / 1000);
   previous = now;
+  if (filming.on) return;
   fitCanvas();
   navigation.step(now, seconds);
   if (player.playing && !scrubbing) advance(seconds);
@@ -542,7 +546,7 @@ function takeBack() {
 function tellPath() {
   const { length } = path;
   at("path-count").textContent = length ? `${length} view${length > 1 ? "s" : ""}, ${path.at(-1).seconds.toFixed(1)} s` : "no view";
-  at("path-save").disabled = !length;
+  at("path-save").disabled = at("path-film").disabled = !length;
 }
 
 function pathText() { return JSON.stringify({ format: "packuv-path", version: 1, scene: scene.name, views: path }, null, 1); }
@@ -551,6 +555,48 @@ function savePath() {
   if (!path.length) return notice("The camera path has no view yet; K adds one.");
   document.documentElement.dataset.path = pathText(); // for automation
   save(`${scene.name.replace(/\.\w+$/, "")}_path.json`, new Blob([pathText()], { type: "application/json" }));
+}
+
+// Every picture of the path is drawn and coded, however long that takes; a lost frame shows the one before it.
+async function film() {
+  if (!path.length) return notice("The camera path has no view yet; K adds one.");
+  if (filming.on) return;
+  const { width, height } = path[0].camera, [even, evenly] = [width, height].map((side) => Math.max(2, side & ~1));
+  const count = Math.floor(path.at(-1).seconds * rate + 1e-9) + 1, before = { state: navigation.state, frame: player.frame };
+  pause();
+  Object.assign(filming, { on: true, stopped: false });
+  try {
+    const recorder = await Recorder.open(even, evenly, scene.rate);
+    Object.assign(canvas, { width: even, height: evenly });
+    for (let number = 0; number < count && !filming.stopped; number++) {
+      notice(`Filming ${number + 1} of ${count}; Esc ends it here.`);
+      const moment = momentOf(path, number / rate);
+      navigation.show(moment.camera);
+      await showFrame(moment.frame);
+      drawPicture();
+      await recorder.add(canvas);
+    }
+    globalThis.filmed = await recorder.finish(); // for automation
+    save(`${scene.name.replace(/\.\w+$/, "")}_film.mp4`, globalThis.filmed);
+    notice("");
+  } catch (error) {
+    notice(error.message, true);
+  } finally {
+    filming.on = false;
+    navigation.change(before.state);
+    seek(before.frame);
+  }
+}
+
+async function showFrame(frame) {
+  seek(frame);
+  do {
+    while (waiting || !buffer.map[frame]) await new Promise((done) => setTimeout(done, 5));
+    const told = new Promise((done) => { filming.told = done; });
+    ask();
+    await told;
+  } while (player.shown !== frame && buffer.map[frame] === HERE && !filming.stopped);
+  filming.told = null;
 }
 
 function savePicture() {
@@ -613,12 +659,13 @@ const KEYS = {
   k: addView,
   Backspace: takeBack,
   j: savePath,
+  g: film,
   p: savePicture,
   t: () => setTruth(cycle(TRUTHS, truth.mode)),
   u: linkHere,
   v: () => setFolded(!document.body.classList.contains("folded")),
   x: () => { if (scene.worst !== undefined) { pause(); seek(scene.worst); } },
-  Escape: () => { dismiss(); setMeasuring(false); },
+  Escape: () => { filming.stopped = true; dismiss(); setMeasuring(false); },
   f: () => setFlying(!navigation.flying),
   r: () => navigation.reset(),
   c: toggleCameras,
@@ -666,6 +713,7 @@ function listen() {
   at("share").oninput = (event) => { at("share-value").textContent = Number(event.target.value).toFixed(2); dirty = true; };
   at("path-add").onclick = addView;
   at("path-save").onclick = savePath;
+  at("path-film").onclick = film;
   at("measure").onclick = KEYS.m;
   at("link").onclick = linkHere;
   at("shot").onclick = savePicture;

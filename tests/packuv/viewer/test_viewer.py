@@ -18,6 +18,7 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -786,6 +787,39 @@ def test_the_page_writes_camera_paths_that_films_read(browser: Browser, tmp_path
         for name in ("width", "height", "fx", "fy", "cx", "cy"):
             assert getattr(view.camera, name) == pytest.approx(wanted[name])
         assert np.allclose(view.camera.camera_from_world, camera.camera_from_world, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_page_films_a_path_as_films_do(browser: Browser, tmp_path: Path) -> None:
+    """Cameras and frames are those of `packuv film`; the pictures are the page's, coded with loss."""
+    source = replace(make_source(count=2000), near=0.1)
+    with running(source) as server:
+        shown_at(browser, server, "play=0&frame=0&camera=cam0&background=0,0,0", 320, 240, 0)
+        press(browser, "k")
+        press(browser, "]")
+        press(browser, "End")
+        browser.wait_for("document.documentElement.dataset.frame == 7")
+        browser.wait_for("document.querySelector('#cameras [aria-current=true]').dataset.camera == 'cam1'")
+        time.sleep(1)  # it has flown there
+        for key in ("k", "j", "g"):
+            press(browser, key)
+        (tmp_path / "path.json").write_text(browser.evaluate("document.documentElement.dataset.path"))
+        browser.wait_for("globalThis.filmed !== undefined")
+        browser.evaluate("filmed.arrayBuffer().then((bytes) => { window.bytes = [...new Uint8Array(bytes)]; })")
+        browser.wait_for("window.bytes !== undefined")
+        (tmp_path / "film.mp4").write_bytes(bytes(browser.evaluate("bytes")))
+    path = CameraPath.load(tmp_path / "path.json")
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        stream = film.streams.video[0]
+        assert (stream.width, stream.height, stream.average_rate) == (160, 120, source.rate)
+        pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(stream)]
+    assert len(pictures) == int(path.seconds * source.rate) + 1
+    for number in (0, 20, 41, len(pictures) - 1):
+        frame, camera = path.at(float(number / source.rate))
+        part = source.parts[0 if frame < 4 else 1 if frame == 4 else 2]
+        drawn = render(source.quantizer.decode(part.frame(frame - part.first)), camera, options=NEAR).colour
+        error = pictures[number] / 255 - np.clip(drawn.transpose(1, 2, 0), 0, 1)
+        assert -10 * np.log10(np.mean(error**2)) > 20, number  # of noise, by H.264 with chroma at half size
 
 
 def test_layers_are_those_of_the_atlas() -> None:
