@@ -155,6 +155,10 @@ class Unfinished:
     def dynamic(self, segment: int) -> np.ndarray:
         return self._part(segment).dynamic
 
+    def reference(self, segment: int) -> int | None:
+        """None: a part that grows is not worth a look at what it shares."""
+        return None
+
     def moving(self, frame: int) -> Codes:
         number, offset = locate(self.segments, frame)
         part = self._part(number)

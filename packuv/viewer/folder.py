@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -22,7 +22,8 @@ from packuv.files import load_json, whole_folder
 from packuv.gaussians.codes import Codes, attribute_count
 from packuv.progress import Progress, no_progress
 from packuv.scene import Scene, open_scene
-from packuv.viewer.source import SceneSource, describe, frame_bytes, key_bytes, tables_bytes
+from packuv.viewer.bodies import Bodies, ReadKey, parents_of, read_frame, read_key, reference_of
+from packuv.viewer.source import SceneSource, describe
 from packuv.viewer.streams import (
     Sheet,
     StreamWriter,
@@ -34,7 +35,7 @@ from packuv.viewer.streams import (
     read_stream,
 )
 
-FORMAT, VERSION, INDEX = "packuv-web", 1, "index.json"
+FORMAT, VERSION, INDEX, VIDEO = "packuv-web", 2, "index.json", "video.json"
 KEY_FILE, DELTA_FILE = "key.ivf", "delta.ivf"
 
 
@@ -65,24 +66,26 @@ def write_web(path: Path, out: Path, *, options: WebOptions, progress: Progress 
     Raises FileExistsError where `out` is no new or empty folder, RuntimeError when a frame does not read back exactly.
     """
     with open_scene(path) as scene, whole_folder(out) as folder:
-        steps = 3 * len(scene)
-        bodies = _write_bodies(scene, folder, lambda done: progress(done, steps))
+        steps = 4 * len(scene)
+        segments, wanted = _write_bodies(scene, folder, lambda done: progress(done, steps))
         video, checks = _write_video(scene, folder, options, lambda done: progress(len(scene) + done, steps))
-        index = {"format": FORMAT, "version": VERSION, "bodies": bodies, "video": video, "crc32": checks}
-        (folder / INDEX).write_text(json.dumps(index, separators=(",", ":")))
+        _write_json(folder / INDEX, {"format": FORMAT, "version": VERSION, "segments": segments})
+        _write_json(folder / VIDEO, {**video, "crc32": checks})
         _write_page(folder)
-        _verify(folder, checks, lambda done: progress(2 * len(scene) + done, steps))
+        _verify(folder, wanted, checks, lambda done: progress(2 * len(scene) + done, steps))
         sizes = {entry.name: entry.stat().st_size for entry in folder.iterdir()}
-    played = {file for file, _, _ in bodies.values()}
-    return WebSummary(
-        len(checks), sum(sizes.values()), sum(sizes[name] for name in played), sizes[KEY_FILE] + sizes[DELTA_FILE]
-    )
+    played = sum(sizes[entry["file"]] for entry in segments)
+    return WebSummary(len(checks), sum(sizes.values()), played, sizes[KEY_FILE] + sizes[DELTA_FILE])
+
+
+def _write_json(path: Path, content: Any) -> None:
+    path.write_text(json.dumps(content, separators=(",", ":")))
 
 
 def _write_page(folder: Path) -> None:
     """The viewer as it is, but for the worker, which finds its data through the index."""
     viewer = files("packuv.viewer")
-    for name in ("viewer.js", "splats.js", "navigation.js"):
+    for name in ("viewer.js", "splats.js", "navigation.js", "film.js"):
         (folder / name).write_text((viewer / name).read_text())
     (folder / "index.html").write_text((viewer / "page.html").read_text())
     (folder / "worker.js").write_text((viewer / "packed.js").read_text() + (viewer / "worker.js").read_text())
@@ -91,30 +94,27 @@ def _write_page(folder: Path) -> None:
 # Deltas
 
 
-def _write_bodies(scene: Scene, folder: Path, progress: Callable[[int], None]) -> dict[str, tuple[str, int, int]]:
-    """What the server of `packuv view` answers, deflated, a file for each segment: path -> file, offset, size."""
+def _write_bodies(
+    scene: Scene, folder: Path, progress: Callable[[int], None]
+) -> tuple[list[dict[str, Any]], list[int]]:
+    """What the server of `packuv view` answers, a file for each segment; sizes of the bodies, as the index has them,
+    and the checksum of every frame with its rows in the page's order."""
     source = SceneSource(scene)
-    (folder / "scene.json").write_text(json.dumps(describe(source)))
-    bodies = _append(folder / "tables.bin", {"tables.bin": tables_bytes(source.quantizer)})
-    done = 0
+    bodies, segments, checks = Bodies(source), [], []
+    _write_json(folder / "scene.json", describe(source))
     for number, frames in enumerate(source.segments):
-        file = folder / f"segment{number:05d}.bin"
-        bodies |= _append(file, {f"segments/{number}.bin": key_bytes(source, number)})
-        for frame in frames:
-            bodies |= _append(file, {f"frames/{frame}.bin": frame_bytes(source, frame)})
-            done += 1
-            progress(done)
-    return bodies
-
-
-def _append(file: Path, contents: Mapping[str, bytes]) -> dict[str, tuple[str, int, int]]:
-    places = {}
-    with file.open("ab") as out:
-        for path, content in contents.items():
-            packed = zlib.compress(content, 6)
-            places[path] = (file.name, out.tell(), len(packed))
-            out.write(packed)
-    return places
+        entry: dict[str, Any] = {"file": f"segment{number:05d}.bin", "parts": [], "frames": []}
+        with (folder / entry["file"]).open("wb") as out:
+            for part in range(bodies.parts(number)):
+                entry["parts"].append(out.write(bodies.part(number, part)))
+            entry["layers"] = out.write(bodies.layers(number))
+            for frame in frames:
+                if frame != frames.start:
+                    entry["frames"].append(out.write(bodies.frame(frame)))
+                checks.append(checksum(bodies.codes(frame)))
+                progress(len(checks))
+        segments.append(entry)
+    return segments, checks
 
 
 # Video
@@ -167,8 +167,8 @@ def checksum(codes: Codes) -> int:
 
 def read_video(folder: Path) -> Iterator[Codes]:
     """Every frame of a folder, from its video streams. Raises ValueError for another folder or a damaged stream."""
-    index = read_index(folder)
-    video = index["video"]
+    read_index(folder)
+    video = load_json(folder / VIDEO)
     codec = WebCodec(video["kind"])
     sheets = [
         Sheet(video[name]["planes"], video[name]["tiles_across"], video[name]["tiles_down"])
@@ -195,19 +195,31 @@ def _next(pictures: Iterator[np.ndarray], folder: Path) -> np.ndarray:
 
 
 def read_deltas(folder: Path) -> Iterator[Codes]:
-    """Every frame of a folder, as its page rebuilds it."""
-    index = read_index(folder)
-    for number, segment in enumerate(index["video"]["segments"]):
-        count, columns, xyz, attributes, tail = _planes(_body(folder, index, f"segments/{number}.bin"))
-        key, dynamic = Codes(xyz, attributes), tail.astype(bool)
-        if (count, columns) != (segment["rows"], attributes.shape[1]):
-            raise ValueError(f"{folder}: segment {number} does not match its index")
-        for frame in range(segment["first"], segment["first"] + segment["frames"]):
-            _, _, step, change, _ = _planes(_body(folder, index, f"frames/{frame}.bin"), key=False)
-            codes = Codes(key.xyz.copy(), key.attributes.copy())
-            codes.xyz[dynamic] += step
-            codes.attributes[dynamic] += change
+    """Every frame of a folder, as its page rebuilds it: rows in the page's order."""
+    keys: dict[int, ReadKey] = {}
+    ways: list[list[int]] = []  # of each segment: those whose keys its own is made of, and itself
+    for number, entry in enumerate(read_index(folder)["segments"]):
+        bodies = _bodies(folder, entry)
+        parts = [next(bodies) for _ in entry["parts"]]
+        reference = reference_of(parts[0])
+        key = read_key(parts, None if reference is None else keys[reference])
+        ways.append([*([] if reference is None else ways[reference]), number])
+        keys = {part: key if part == number else keys[part] for part in ways[-1]}
+        next(bodies)  # the layers of the UV map
+        coded, known = list(bodies), {0: key.codes[: key.dynamic]}
+        for offset in range(len(coded) + 1):
+            codes = Codes(key.codes.xyz.copy(), key.codes.attributes.copy())
+            moving = _moving(known, coded, offset)
+            codes.xyz[: key.dynamic], codes.attributes[: key.dynamic] = moving.xyz, moving.attributes
             yield codes
+
+
+def _moving(known: dict[int, Codes], coded: Sequence[bytes], offset: int) -> Codes:
+    """The moving rows of a frame of a segment; adds it and its parents to those known."""
+    if offset not in known:
+        body = coded[offset - 1]
+        known[offset] = read_frame(body, [_moving(known, coded, k) for k in parents_of(body, offset, len(coded) + 1)])
+    return known[offset]
 
 
 def read_index(folder: Path) -> dict[str, Any]:
@@ -222,28 +234,22 @@ def read_index(folder: Path) -> dict[str, Any]:
     return index
 
 
-def _body(folder: Path, index: Mapping[str, Any], path: str) -> bytes:
-    file, offset, size = index["bodies"][path]
-    with (folder / file).open("rb") as opened:
-        opened.seek(offset)
-        try:
-            return zlib.decompress(opened.read(size))
-        except zlib.error as error:
-            raise ValueError(f"{folder / file}: {path} is damaged ({error})") from None
+def _bodies(folder: Path, entry: Mapping[str, Any]) -> Iterator[bytes]:
+    """All bodies of a segment, inflated, in the order of their file: parts, layers, frames."""
+    with (folder / entry["file"]).open("rb") as opened:
+        for size in (*entry["parts"], entry["layers"], *entry["frames"]):
+            at = opened.tell()
+            try:
+                yield zlib.decompress(opened.read(size))
+            except zlib.error as error:
+                raise ValueError(f"{folder / entry['file']}: {size} bytes from {at} are damaged ({error})") from None
 
 
-def _planes(body: bytes, *, key: bool = True) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, columns, positions [n, 3], attributes [n, A], and what follows, of a key's body or a frame's."""
-    first, second, columns, _ = np.frombuffer(body, "<u4", 4).tolist()
-    count = first if key else second
-    xyz = np.frombuffer(body, "<u2", 3 * count, 16).reshape(3, count).T.astype(np.uint16)
-    attributes = np.frombuffer(body, np.uint8, columns * count, 16 + 6 * count).reshape(columns, count).T
-    return count, columns, xyz, attributes.copy(), np.frombuffer(body, np.uint8, -1, 16 + (6 + columns) * count)
-
-
-def _verify(folder: Path, checks: list[int], progress: Callable[[int], None]) -> None:
-    for frame, pair in enumerate(zip(read_video(folder), read_deltas(folder), strict=True)):
-        for codes, what in zip(pair, ("video streams", "deltas"), strict=True):
-            if checksum(codes) != checks[frame]:
+def _verify(folder: Path, wanted: list[int], checks: list[int], progress: Callable[[int], None]) -> None:
+    done = 0
+    for what, frames, sums in (("video streams", read_video(folder), checks), ("deltas", read_deltas(folder), wanted)):
+        for frame, (codes, check) in enumerate(zip(frames, sums, strict=True)):
+            if checksum(codes) != check:
                 raise RuntimeError(f"frame {frame} does not read back from the {what} as it was written")
-        progress(frame + 1)
+            done += 1
+            progress(done)

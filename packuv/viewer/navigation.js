@@ -52,6 +52,12 @@ export class Navigation {
     this.moveTo(target, animate);
   }
 
+  // The very view of a camera that is none of the capture, at once.
+  show(camera) {
+    this.exact = null;
+    this.moveTo(this.stateOf(camera), false);
+  }
+
   stateOf({ camera_from_world: pose, ...camera }) {
     const optics = Object.fromEntries(OPTICS.map((name) => [name, camera[name]]));
     const axes = pose.slice(0, 3).map((row) => row.slice(0, 3));

@@ -1,6 +1,6 @@
-// For a scene in a folder of static files (`packuv web`), put before worker.js: what the worker fetches lies in few large
-// files, deflated; index.json says where. Parts are fetched by HTTP range; a server that knows no ranges sends the whole
-// file, of which the last few are kept. docs/viewer.md describes the folder.
+// For a scene in a folder of static files (`packuv web`), put before worker.js: what the worker fetches lies in a file
+// for each segment, deflated; index.json has the sizes. Parts of files are fetched by HTTP range; a server that knows no
+// ranges sends the whole file, of which the last few are kept. docs/viewer.md describes the folder.
 "use strict";
 
 (() => {
@@ -13,8 +13,10 @@
   self.fetch = async (path, options = {}) => {
     index ??= open();
     index.catch(() => { index = null; }); // the next request tries again
-    const place = (await index).bodies[path];
-    if (!place) return plain(path, options);
+    const [what, number, inner = "0"] = path.replace(/\.bin$/, "").split("/");
+    if (!["segments", "frames", "layers"].includes(what)) return plain(path, options);
+    const place = placeOf(await index, what, Number(number), Number(inner));
+    if (!place) return new Response(`${path} is not there`, { status: 404 });
     try {
       const bytes = await part(place, options.signal);
       return await inflated(bytes, path);
@@ -23,6 +25,23 @@
       return new Response(error.message, { status: error.status });
     }
   };
+
+  // File, offset and size. In a file: the parts of the key, the layers, the frames after the key.
+  function placeOf({ segments }, what, number, inner) {
+    let segment = number, at = inner;
+    if (what === "frames") {
+      segment = 0;
+      for (at = number; segment < segments.length && at > segments[segment].frames.length; segment++) {
+        at -= segments[segment].frames.length + 1;
+      }
+    }
+    const { file, parts, layers, frames } = segments[segment] ?? { parts: [], frames: [] };
+    if (what === "layers") at = parts.length;
+    if (what === "frames") at += parts.length;
+    const sizes = [...parts, layers, ...frames];
+    const sum = (list) => list.reduce((total, size) => total + size, 0);
+    return file && at < sizes.length ? [file, sum(sizes.slice(0, at)), sizes[at]] : null;
+  }
 
   async function inflated(bytes, path) {
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));

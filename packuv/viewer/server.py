@@ -16,7 +16,7 @@ import webbrowser
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -25,30 +25,22 @@ from urllib.parse import unquote
 
 import cv2
 
-from packuv.gaussians.uvsize import UvOptions
-from packuv.viewer.source import (
-    Source,
-    Truth,
-    describe,
-    frame_bytes,
-    key_bytes,
-    layer_bytes,
-    open_source,
-    tables_bytes,
-)
+from packuv.viewer.bodies import Bodies
+from packuv.viewer.source import Source, Truth, describe, open_source
 
 PAGES = {
     "/": ("page.html", "text/html; charset=utf-8"),
     "/viewer.js": ("viewer.js", "text/javascript; charset=utf-8"),
     "/splats.js": ("splats.js", "text/javascript; charset=utf-8"),
     "/navigation.js": ("navigation.js", "text/javascript; charset=utf-8"),
+    "/film.js": ("film.js", "text/javascript; charset=utf-8"),
     "/worker.js": ("worker.js", "text/javascript; charset=utf-8"),
 }
 """Path to file beside this module and its type; nothing else on disk is reachable"""
 
-BINARY = "application/octet-stream"
+BINARY, JSON = "application/octet-stream", "application/json"
 PICTURE = re.compile(r"/truth/([^/]{1,600})/(0|[1-9][0-9]{0,8})\.png")
-NUMBERED = re.compile(r"/(segments|frames|layers)/(0|[1-9][0-9]{0,8})\.bin")
+NUMBERED = re.compile(r"/(segments|frames|layers)/(0|[1-9][0-9]{0,8})(?:/(0|[1-9][0-9]{0,3}))?\.bin")
 
 POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """Content security policy: a page that tries to reach another origin fails at once"""
@@ -136,13 +128,12 @@ class ViewerServer(ThreadingHTTPServer):
         grown: Grown | None = None,
     ) -> None:
         super().__init__(address, _Handler)
-        self.source, self.worst, self.truth = source, worst, truth
+        self.worst, self._grown = worst, grown
+        self.source, self.truth, self.bodies = source, truth, Bodies(source)
         self.made = 0
         """Counts the states of what grows"""
-        self._grown = grown
-        self.reading = threading.Lock()  # decoders keep state
+        self._looking = threading.Lock()
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        self.tables = lru_cache(maxsize=1)(lambda: tables_bytes(source.quantizer))
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Hang up on a caller too many."""
@@ -171,57 +162,75 @@ class ViewerServer(ThreadingHTTPServer):
     def is_loopback(self) -> bool:
         return self.server_address[0] in ("127.0.0.1", "::1")
 
-    def content(self, path: str) -> tuple[bytes, str] | None:
-        """Body and type of a path without its query; None where there is nothing."""
+    def content(self, path: str) -> Content | None:
+        """What a path without its query holds; None where there is nothing."""
         if path in PAGES:
             name, kind = PAGES[path]
-            return Path(__file__).with_name(name).read_bytes(), kind
+            return Content(_deflated(Path(__file__).with_name(name).read_bytes()), kind)
         if path == "/scene.json":
             self._look_again()
             growing = {"made": self.made} if self._grown else {}
             marked = {} if self.worst is None else {"worst": self.worst}
             filmed = {"truth": list(self.truth.cameras)} if self.truth else {}
-            told = {**describe(self.source), **marked, **filmed, **growing, "layers": UvOptions.layers}
-            return json.dumps(told).encode(), "application/json"
-        if path == "/tables.bin":
-            return self.tables(), BINARY
+            told = {**describe(self.source), **marked, **filmed, **growing}
+            return Content(_deflated(json.dumps(told).encode()), JSON)
         if asked := PICTURE.fullmatch(path):
             return self._filmed(unquote(asked[1]), int(asked[2]))
-        numbered = NUMBERED.fullmatch(path)
-        return self._numbered(numbered[1], int(numbered[2])) if numbered else None
+        if numbered := NUMBERED.fullmatch(path):
+            return self._numbered(numbered[1], *(int(number) for number in numbered.groups()[1:] if number))
+        return None
 
     def _look_again(self) -> None:
-        with self.reading:
+        with self._looking:
             if self._grown and (now := self._grown()):
-                (self.source, self.truth), self.made = now, self.made + 1
+                self.source, self.truth = now
+                self.bodies, self.made = Bodies(self.source), self.made + 1
 
     def is_past(self, query: str) -> bool:
         """Whether a page asks for something of a state that is over: frames had other numbers."""
         known = STATE.search(query)
         return bool(self._grown and known and int(known[1]) != self.made)
 
-    def _filmed(self, camera: str, frame: int) -> tuple[bytes, str] | None:
+    def _filmed(self, camera: str, frame: int) -> Content | None:
         if not self.truth or camera not in self.truth.cameras or frame >= self.source.segments[-1].stop:
             return None
         pixels = self.truth.picture(camera, frame)
         if pixels is None:
             return None
         written = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-        return written.tobytes(), "image/png"
+        return Content(_deflated(written.tobytes()), "image/png")
 
-    def _numbered(self, what: str, number: int) -> tuple[bytes, str] | None:
-        build = {"segments": key_bytes, "frames": frame_bytes, "layers": layer_bytes}[what]
+    def _numbered(self, what: str, *numbers: int) -> Content | None:
+        bodies = self.bodies
+        made: dict[tuple[str, int], Callable[..., bytes]] = {
+            ("segments", 2): bodies.part,
+            ("frames", 1): bodies.frame,
+            ("layers", 1): bodies.layers,
+        }
+        make = made.get((what, len(numbers)))
         try:
-            with self.reading:
-                return build(self.source, number), BINARY
+            return Content(make(*numbers), BINARY) if make else None
         except IndexError:
             return None
+
+
+@dataclass(frozen=True)
+class Content:
+    """What an address holds."""
+
+    deflated: bytes
+    kind: str
+
+
+def _deflated(content: bytes) -> bytes:
+    return zlib.compress(content, 6)
 
 
 class _Handler(BaseHTTPRequestHandler):
     server: ViewerServer
     timeout = PATIENCE_SECONDS
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # a body must not wait until its head is acknowledged
     server_version = "packuv"
     _decode_ms: float | None = None
     """That the answer took to be found"""
@@ -251,22 +260,21 @@ class _Handler(BaseHTTPRequestHandler):
         if found is None:
             return self._send(HTTPStatus.NOT_FOUND, b"nothing here\n", "text/plain; charset=utf-8", with_body)
         self._decode_ms = 1000 * (time.perf_counter() - started)
-        self._send(HTTPStatus.OK, *found, with_body)
+        if "deflate" in self.headers.get("Accept-Encoding", ""):
+            return self._send(HTTPStatus.OK, found.deflated, found.kind, with_body, encoding="deflate")
+        self._send(HTTPStatus.OK, zlib.decompress(found.deflated), found.kind, with_body)
 
     def _is_rebound(self) -> bool:
         """True if a name of another site was made to point here: its page must not read the scene."""
         host = re.sub(r":\d+$", "", self.headers.get("Host", "localhost"))
         return self.server.is_loopback and host not in LOOPBACK
 
-    def _send(self, status: HTTPStatus, body: bytes, kind: str, with_body: bool) -> None:
-        deflate = "deflate" in self.headers.get("Accept-Encoding", "")
-        if deflate:
-            body = zlib.compress(body, 1)
+    def _send(self, status: HTTPStatus, body: bytes, kind: str, with_body: bool, *, encoding: str = "") -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
-        if deflate:
-            self.send_header("Content-Encoding", "deflate")
+        if encoding:
+            self.send_header("Content-Encoding", encoding)
         if self._decode_ms is not None:
             self.send_header("Server-Timing", f"decode;dur={self._decode_ms:.1f}")
         self.send_header("Vary", "Accept-Encoding")

@@ -1,10 +1,4 @@
-"""What the viewer shows, and the bytes it sends for it.
-
-Integers travel, never floats made on the way: a keyframe as all its codes, every other frame as the difference of
-its dynamic rows to the keyframe, modulo the width of the code. The page adds them up and looks the values up in the
-quantizer's own tables, so that it draws from the very float32 values that the fit rendered. docs/viewer.md gives the
-layout byte by byte.
-"""
+"""What the viewer shows: a scene file, or segments in memory, and how the page is told of it."""
 
 from __future__ import annotations
 
@@ -21,9 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from packuv.camera import PinholeCamera
-from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
+from packuv.gaussians.codes import Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
-from packuv.gaussians.uvmap import assign_slots
 from packuv.gaussians.uvsize import UvOptions
 from packuv.scene import Scene, open_scene
 
@@ -33,8 +26,8 @@ NEAR_SHARE = 0.02
 CACHE_BYTES = 64 << 20
 """Dynamic rows that a scene file keeps decoded: requests arrive slightly out of order, and going back costs a key"""
 
-KEPT_KEYS = 2
-"""Keyframes that a scene file keeps decoded: playback crosses from one segment into the next"""
+KEPT_KEYS = 4
+"""Keyframes that a scene file keeps decoded: that of a segment and those it takes rows from, and the next segment's"""
 
 
 class Source(Protocol):
@@ -87,6 +80,9 @@ class Source(Protocol):
 
     def dynamic(self, segment: int) -> np.ndarray:
         """bool [N]: the D rows that may differ from the keyframe within the segment."""
+
+    def reference(self, segment: int) -> int | None:
+        """An earlier segment whose key shares rows with this one's, if that is worth a look."""
 
     def moving(self, frame: int) -> Codes:
         """The D dynamic rows of a frame."""
@@ -145,6 +141,9 @@ class SegmentSource:
     def dynamic(self, segment: int) -> np.ndarray:
         return self.parts[segment].dynamic
 
+    def reference(self, segment: int) -> int | None:
+        return None
+
     def moving(self, frame: int) -> Codes:
         segment, offset = locate(self.segments, frame)
         part = self.parts[segment]
@@ -179,6 +178,9 @@ class SceneSource:
     def dynamic(self, segment: int) -> np.ndarray:
         entry = self._scene.index.segments[segment]
         return np.arange(entry.rows) < entry.dynamic
+
+    def reference(self, segment: int) -> int | None:
+        return self._scene.index.segments[segment].reference
 
     def moving(self, frame: int) -> Codes:
         if frame not in self._moving:
@@ -223,12 +225,14 @@ def describe(source: Source) -> dict[str, Any]:
     return {
         "name": source.name,
         "rate": [source.rate.numerator, source.rate.denominator],
-        "times_ns": (source.times_ns - source.times_ns[0]).tolist(),
+        "steps_ns": np.diff(source.times_ns).tolist(),
         "sh_degree": quantizer.sh_degree,
         "columns": attribute_count(quantizer.sh_degree),
         "centre": quantizer.centre.tolist(),
+        "tables": tables(quantizer),
         "near": near_plane(source),
         "metric": source.metric,
+        "layers": UvOptions.layers,
         "segments": [{"first": frames.start, "length": len(frames)} for frames in source.segments],
         "cameras": [{**camera.to_json(), "held_out": camera.name in source.held_out} for camera in source.cameras],
         **({"light": source.light.tolist()} if source.light.any() else {}),
@@ -247,45 +251,23 @@ def near_plane(source: Source) -> float:
     return NEAR_SHARE * (radius or source.quantizer.unit)
 
 
-def tables_bytes(quantizer: Quantizer) -> bytes:
-    """float32 little-endian: positions [3, 65536], then attributes [A, 256]."""
-    return quantizer.xyz_table.astype("<f4").tobytes() + quantizer.attribute_table.astype("<f4").tobytes()
+def tables(quantizer: Quantizer) -> dict[str, Any]:
+    """The quantizer's tables as rules that any IEEE arithmetic follows to the last bit, and where they miss."""
+    growth = np.exp(np.log1p(quantizer.reach / quantizer.unit) / 65535)  # [3], of the logarithmic scale, by half a code
+    guess, exact = _followed(quantizer.centre, quantizer.unit, growth), quantizer.xyz_table
+    missed = zip(*np.nonzero(guess != exact), strict=True)
+    return {
+        "unit": quantizer.unit,
+        "growth": growth.tolist(),
+        "except": [[int(axis), int(code), float(exact[axis, code])] for axis, code in missed],
+        "low": quantizer.low.tolist(),
+        "step": ((quantizer.high - quantizer.low) / 255).tolist(),
+    }
 
 
-def key_bytes(source: Source, segment: int) -> bytes:
-    """A keyframe, all N rows, plane by plane: head (N, D, A, 0), xyz [3, N], attributes [A, N], dynamic [N]."""
-    if not 0 <= segment < len(source.segments):
-        raise IndexError(f"segment {segment} of a scene with {len(source.segments)}")
-    codes, dynamic = source.key(segment), source.dynamic(segment)
-    head = _head(len(codes), int(dynamic.sum()), codes)
-    return head + _planes(codes.xyz, codes.attributes) + dynamic.astype(np.uint8).tobytes()
-
-
-def layer_bytes(source: Source, segment: int) -> bytes:
-    """Layer of the UV map, from 1 on, that takes each of the N rows of a keyframe, uint8; 0 where none does, or the row
-    is absent there. As in the atlas of `packuv atlas` with its default size."""
-    if not 0 <= segment < len(source.segments):
-        raise IndexError(f"segment {segment} of a scene with {len(source.segments)}")
-    codes = source.key(segment)
-    shown = np.flatnonzero(codes.attributes[:, OPACITY] > 0)
-    points = source.quantizer.decode(codes[shown]).means
-    slots = assign_slots(points, codes.attributes[shown, OPACITY], source.quantizer.centre, options=UvOptions())
-    layers = np.zeros(len(codes), np.uint8)
-    layers[shown] = slots.layer + 1
-    return layers.tobytes()
-
-
-def frame_bytes(source: Source, frame: int) -> bytes:
-    """A frame's D dynamic rows, less its keyframe's: head (segment, D, A, 0), xyz [3, D], attributes [A, D]."""
-    segment, _ = locate(source.segments, frame)
-    key, codes = source.key(segment)[source.dynamic(segment)], source.moving(frame)
-    # unsigned, so modulo 2^16 and 2^8
-    return _head(segment, len(codes), codes) + _planes(codes.xyz - key.xyz, codes.attributes - key.attributes)
-
-
-def _head(first: int, second: int, codes: Codes) -> bytes:
-    return np.array([first, second, codes.attributes.shape[1], 0], dtype="<u4").tobytes()
-
-
-def _planes(xyz: np.ndarray, attributes: np.ndarray) -> bytes:
-    return xyz.T.astype("<u2").tobytes() + attributes.T.tobytes()
+def _followed(centre: np.ndarray, unit: float, growth: np.ndarray) -> np.ndarray:
+    """Positions float32 [3, 65536] by products alone: of two machines, exponentials may differ in the last bit."""
+    powers = np.repeat((growth * growth)[:, None], 32768, axis=1)
+    powers[:, 0] = growth
+    away = unit * (np.multiply.accumulate(powers, axis=1) - 1)  # of codes 32768 to 65535
+    return np.concatenate([centre[:, None] - away[:, ::-1], centre[:, None] + away], axis=1).astype(np.float32)

@@ -2,6 +2,7 @@
 
 import { DEPTH_STOPS, MODES, SplatView } from "./splats.js";
 import { Navigation, frusta, worldOf } from "./navigation.js";
+import { Recorder, momentOf } from "./film.js";
 
 const VIEW_SECONDS = 2; // of a camera path, from view to view at least
 const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
@@ -14,15 +15,16 @@ const at = (id) => document.getElementById(id);
 const canvas = at("picture");
 const wish = new URLSearchParams(location.hash.slice(1)); // frame, camera, mode, play=0, scale, background, bare=1
 
-const look = { mode: "colour", bands: 15, scale: 1, background: [0, 0, 0], range: [1, 2], light: [1, 1, 1], lines: false };
+const look = { mode: "colour", bands: 15, arrived: 15, scale: 1, background: [0, 0, 0], range: [1, 2], light: [1, 1, 1], lines: false };
 const player = {
   frame: 0, step: 1, ends: "loop", shown: -1, playing: wish.get("play") !== "0", speed: 1, due: 0,
-  stalled: false, stalledAt: 0, stalls: 0,
+  stalled: false, stalledAt: 0, stalls: 0, overtaken: 0, // frames whose time was over before they were drawn
 };
 const ENDS = { loop: "Loop", bounce: "Ping-pong", stop: "Once" }; // what happens at the last frame
 const TRUTHS = ["", "beside", "over", "minus"];
 const truth = { mode: "", loading: "", shown: "" }; // addresses of pictures
 const path = []; // views of a camera path, as packuv.film reads them
+const filming = { on: false, stopped: false, told: null }; // told: hears that a picture has come
 const layered = { shown: -1, asked: -1 }; // segments
 const ruler = { on: false, points: [] }; // world
 const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
@@ -55,11 +57,11 @@ const receive = {
     splats.setLines(frusta(scene, world));
     fillPage();
     if (scene.made !== undefined) setTimeout(lookForMore, LOOK_MS);
+    document.documentElement.dataset.stalls = 0; // for automation
     requestAnimationFrame(tick);
   },
   buffered({ map, ahead }) {
-    Object.assign(buffer, { map, ahead });
-    drawMarks();
+    Object.assign(buffer, { map, ahead, fresh: true });
   },
   layers({ segment, layers }) {
     if (segment !== layered.shown) return;
@@ -67,7 +69,10 @@ const receive = {
     document.documentElement.dataset.layers = segment; // for automation
     dirty = true;
   },
-  miss() { waiting = false; stale = false; },
+  part() { // of a key; the page asks for it as long as nothing whole is on screen
+    if (player.shown < 0) stale = true;
+  },
+  miss() { waiting = false; stale = false; filming.told?.(); },
   picture(message) {
     waiting = false;
     if (message.key) splats.setKey(message.key.packed, message.key.slotCount, message.moving);
@@ -79,10 +84,14 @@ const receive = {
     settleRange(message.range, message.frame !== player.shown && player.shown >= 0);
     if (message.frame !== player.shown) meter.frames++;
     player.shown = message.frame;
-    look.light = (scene.light?.[message.frame] ?? [0, 0, 0]).map((log) => Math.exp(log / GAMMA));
+    look.arrived = message.bands;
+    const lit = message.frame < 0 ? scene.segments[message.segment].first : message.frame;
+    look.light = (scene.light?.[lit] ?? [0, 0, 0]).map((log) => Math.exp(log / GAMMA));
     const { count, moving, sort_ms, visible, traffic } = message;
+    if (visible) document.documentElement.dataset.first ??= performance.now(); // for automation: ms to a picture
     Object.assign(meter, { count, moving, sort_ms, visible, traffic });
     dirty = true;
+    filming.told?.();
   },
   lost({ count, text }) {
     at("lost").hidden = false;
@@ -138,9 +147,11 @@ function advance(seconds) {
     if (player.due < shownFor(player.frame)) break;
     if (!buffer.map[next.frame]) { stall(); break; }
     player.due -= shownFor(player.frame);
+    if (player.frame !== player.shown && buffer.map[player.frame] === HERE) player.overtaken++;
     Object.assign(player, next);
   }
   if (moved) { stale = true; tellPlayhead(); showClock(); }
+  document.documentElement.dataset.overtaken = player.overtaken; // for automation
 }
 
 function shownFor(frame) { // seconds; frames need not be evenly spaced
@@ -158,7 +169,7 @@ function following({ frame, step }) { // frame and direction; null at the end
 
 function stall() {
   player.stalled = true;
-  player.stalls++;
+  document.documentElement.dataset.stalls = ++player.stalls; // for automation
   player.stalledAt = performance.now();
   player.due = 0;
   tellPlayhead();
@@ -199,11 +210,13 @@ function tick(now) {
   requestAnimationFrame(tick);
   const seconds = Math.min(0.25, (now - previous) / 1000);
   previous = now;
+  if (filming.on) return;
   fitCanvas();
   navigation.step(now, seconds);
   if (player.playing && !scrubbing) advance(seconds);
   if (!waiting && (stale || player.frame !== player.shown && buffer.map[player.frame] === HERE)) ask();
   if (dirty) drawPicture();
+  if (buffer.fresh) drawMarks();
   if (now - meter.since > 1000) showSpeeds(now);
 }
 
@@ -211,7 +224,7 @@ function drawPicture() {
   dirty = false;
   const view = navigation.view();
   const started = performance.now();
-  splats.draw(view, look);
+  splats.draw(view, { ...look, bands: look.bands & look.arrived });
   meter.submit_ms = performance.now() - started;
   meter.drawn++;
   drawRuler();
@@ -281,15 +294,17 @@ function setTruth(mode) {
 
 function drawMarks() {
   const marks = at("marks"), pen = marks.getContext("2d");
+  buffer.fresh = false;
   marks.width = Math.max(1, marks.clientWidth);
   const step = marks.width / frameCount;
   pen.fillStyle = "#ffffff1c";
   pen.fillRect(0, 0, marks.width, 10);
   pen.fillStyle = "#6cb2ff66";
-  for (let first = 0, frame = 0; frame <= frameCount; frame++) { // runs: single frames would leave seams
-    if (buffer.map[frame]) continue;
+  for (let frame = 0; frame < frameCount; frame++) { // runs: single frames would leave seams
+    if (!buffer.map[frame]) continue;
+    const first = frame;
+    while (buffer.map[frame]) frame++;
     pen.fillRect(first * step, 0, (frame - first) * step, 10);
-    first = frame + 1;
   }
   pen.fillStyle = "#ff6b6b";
   for (let frame = 0; frame < frameCount; frame++) {
@@ -333,6 +348,7 @@ function showStats(drawn, seconds) {
     "drawn": drawn, "Gaussians drawn": visible.toLocaleString("en"), "decode, server": ms(traffic.decode_ms),
     "unpack": ms(traffic.unpack_ms), "sort": ms(meter.sort_ms), "draw, processor": ms(meter.submit_ms),
     "draw, GPU": splats.gpu_ms === null ? "not told" : ms(splats.gpu_ms), "stalls": player.stalls,
+    "too slow to draw": player.overtaken,
     "received": `${((traffic.bytes ?? 0) / 1e6).toFixed(2)} MB`, "network": `${(rate_kb || 0).toFixed(0)} kB/s`,
     "picture": `${canvas.width} × ${canvas.height}`,
   };
@@ -552,7 +568,7 @@ function takeBack() {
 function tellPath() {
   const { length } = path;
   at("path-count").textContent = length ? `${length} view${length > 1 ? "s" : ""}, ${path.at(-1).seconds.toFixed(1)} s` : "no view";
-  at("path-save").disabled = !length;
+  at("path-save").disabled = at("path-film").disabled = !length;
 }
 
 function pathText() { return JSON.stringify({ format: "packuv-path", version: 1, scene: scene.name, views: path }, null, 1); }
@@ -561,6 +577,48 @@ function savePath() {
   if (!path.length) return notice("The camera path has no view yet; K adds one.");
   document.documentElement.dataset.path = pathText(); // for automation
   save(`${scene.name.replace(/\.\w+$/, "")}_path.json`, new Blob([pathText()], { type: "application/json" }));
+}
+
+// Every picture of the path is drawn and coded, however long that takes; a lost frame shows the one before it.
+async function film() {
+  if (!path.length) return notice("The camera path has no view yet; K adds one.");
+  if (filming.on) return;
+  const { width, height } = path[0].camera, [even, evenly] = [width, height].map((side) => Math.max(2, side & ~1));
+  const count = Math.floor(path.at(-1).seconds * rate + 1e-9) + 1, before = { state: navigation.state, frame: player.frame };
+  pause();
+  Object.assign(filming, { on: true, stopped: false });
+  try {
+    const recorder = await Recorder.open(even, evenly, scene.rate);
+    Object.assign(canvas, { width: even, height: evenly });
+    for (let number = 0; number < count && !filming.stopped; number++) {
+      notice(`Filming ${number + 1} of ${count}; Esc ends it here.`);
+      const moment = momentOf(path, number / rate);
+      navigation.show(moment.camera);
+      await showFrame(moment.frame);
+      drawPicture();
+      await recorder.add(canvas);
+    }
+    globalThis.filmed = await recorder.finish(); // for automation
+    save(`${scene.name.replace(/\.\w+$/, "")}_film.mp4`, globalThis.filmed);
+    notice("");
+  } catch (error) {
+    notice(error.message, true);
+  } finally {
+    filming.on = false;
+    navigation.change(before.state);
+    seek(before.frame);
+  }
+}
+
+async function showFrame(frame) {
+  seek(frame);
+  do {
+    while (waiting || !buffer.map[frame]) await new Promise((done) => setTimeout(done, 5));
+    const told = new Promise((done) => { filming.told = done; });
+    ask();
+    await told;
+  } while (player.shown !== frame && buffer.map[frame] === HERE && !filming.stopped);
+  filming.told = null;
 }
 
 function savePicture() {
@@ -623,12 +681,13 @@ const KEYS = {
   k: addView,
   Backspace: takeBack,
   j: savePath,
+  g: film,
   p: savePicture,
   t: () => setTruth(cycle(TRUTHS, truth.mode)),
   u: linkHere,
   v: () => setFolded(!document.body.classList.contains("folded")),
   x: () => { if (scene.worst !== undefined) { pause(); seek(scene.worst); } },
-  Escape: () => { dismiss(); setMeasuring(false); },
+  Escape: () => { filming.stopped = true; dismiss(); setMeasuring(false); },
   f: () => setFlying(!navigation.flying),
   r: () => navigation.reset(),
   c: toggleCameras,
@@ -676,6 +735,7 @@ function listen() {
   at("share").oninput = (event) => { at("share-value").textContent = Number(event.target.value).toFixed(2); dirty = true; };
   at("path-add").onclick = addView;
   at("path-save").onclick = savePath;
+  at("path-film").onclick = film;
   at("measure").onclick = KEYS.m;
   at("link").onclick = linkHere;
   at("shot").onclick = savePicture;

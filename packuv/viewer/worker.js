@@ -10,19 +10,23 @@ const KEPT_KEYS = 4;
 const BINS = 65536;
 const RETRY_MS = [300, 1000, 3000, 10000];
 const NEVER = new Set([404, 410, 416, 422, 500]); // answers that stay: what is damaged or missing; others are tried again
+const SPAN = 8; // frames from one that is predicted from the key alone to the next
+const NO_REFERENCE = 2 ** 32 - 1;
+const OPACITY = 6, COLOURS = 7, REST = 10; // columns: opacity, the first colour, the first that depends on the view
+const ROW_BEFORE = 1, GREEN = 2; // what was taken from a plane
 
 let scene = null;
 let tables = null; // Float32Array: positions [3, 65536], then attributes [A, 256]
 let layers = 1; // 16-byte texels per Gaussian
 let owners = []; // segment of every frame
-const keys = new Map(); // segment -> Promise of a key
+const keys = new Map(); // segment -> {key, whole: Promise of the key}
 const frames = new Map(); // frame -> {segment, packed, bytes}
-const fetching = new Map(); // frame -> AbortController
+const fetching = new Map(); // frame -> {control: AbortController, arrival: Promise}
 const lost = new Set(); // frames that are damaged or missing; the rest plays on without them
 let playhead = { frame: 0, step: 1, ends: "loop" };
 let failures = 0;
 let resumeAt = 0; // no fetch before this time after a failure
-let sent = { segment: -1, frame: -1 }; // what the page holds
+let sent = { segment: -1, frame: -1, version: 0 }; // what the page holds; of a key that is not whole, frame is -1
 const counts = new Uint32Array(BINS + 1);
 const depths = { values: new Float32Array(0), bits: null, slots: null, bins: null }; // room for the sort
 
@@ -38,21 +42,46 @@ function complain(error) { postMessage({ type: "problem", text: String(error.mes
 
 async function open() {
   scene = await (await get("scene.json")).json();
-  tables = new Float32Array(await (await get("tables.bin")).arrayBuffer());
+  let time = 0;
+  scene.times_ns = [0, ...scene.steps_ns.map((step) => (time += step))];
+  tables = tablesOf(scene.tables);
   layers = Math.ceil((6 + scene.columns) / 16);
-  scene.segments.forEach(({ length }, number) => owners.push(...new Array(length).fill(number)));
+  scene.segments.forEach(({ length }, number) => { for (let k = 0; k < length; k++) owners.push(number); });
   postMessage({ type: "scene", scene, tables, layers });
   prefetch();
 }
 
 // Where something lies; of what grows, in the state that this page knows.
 function addressOf(path) { return scene?.made === undefined ? path : `${path}?made=${scene.made}`; }
+// Products and sums alone, which are the same everywhere to the last bit; what they miss is told.
+function tablesOf({ unit, growth, except, low, step }) {
+  const values = new Float32Array(3 * 65536 + 256 * low.length);
+  growth.forEach((half, axis) => {
+    const grown = half * half, middle = 65536 * axis + 32768;
+    for (let k = 0, power = half; k < 32768; k++, power *= grown) {
+      const away = unit * (power - 1);
+      values[middle + k] = scene.centre[axis] + away;
+      values[middle - 1 - k] = scene.centre[axis] - away;
+    }
+  });
+  for (const [axis, code, value] of except) values[65536 * axis + code] = value;
+  for (let column = 0, at = 3 * 65536; column < low.length; column++) {
+    for (let code = 0; code < 256; code++) values[at++] = low[column] + code * step[column];
+  }
+  return values;
+}
 
 async function get(path, signal) {
   const answer = await fetch(addressOf(path), { signal });
   if (answer.ok) return answer;
   const text = (await answer.text()).trim() || `${path}: ${answer.status}`;
   throw NEVER.has(answer.status) ? new LostError(text) : new Error(text);
+}
+
+async function bytesOf(path, signal) {
+  const bytes = await (await get(path, signal)).arrayBuffer();
+  tally(path);
+  return bytes;
 }
 
 class LostError extends Error {}
@@ -88,11 +117,36 @@ function upcoming() {
   return list;
 }
 
+// Frames from which one is predicted; none of the key of its segment.
+function parentsOf(frame) {
+  const { first, length } = scene.segments[owners[frame]], offset = frame - first;
+  let low = offset - (offset % SPAN), high = Math.min(low + SPAN, length - 1);
+  if (offset === low || offset === high) return offset ? [first] : [];
+  for (let middle; (middle = (low + high) >> 1) !== offset;) [low, high] = offset < middle ? [low, middle] : [middle, high];
+  return [first + low, first + high];
+}
+
+// What is coming up, each frame after those from which it is predicted.
+function needed() {
+  const list = new Set();
+  const add = (frame) => {
+    if (list.has(frame)) return;
+    if (!frames.has(frame)) parentsOf(frame).forEach(add);
+    list.add(frame);
+  };
+  upcoming().forEach(add);
+  return list;
+}
+
 function prefetch() {
   if (!scene) return;
-  const wanted = upcoming();
-  const near = new Set(wanted);
-  for (const [frame, control] of fetching) if (!near.has(frame)) control.abort();
+  const wanted = needed();
+  for (const [frame, { control }] of fetching) {
+    if (wanted.has(frame)) continue;
+    control.abort();
+    fetching.delete(frame);
+  }
+  forgetKeys();
   if (performance.now() < resumeAt) return;
   for (const frame of wanted) {
     if (fetching.size >= FETCHES) break;
@@ -101,27 +155,38 @@ function prefetch() {
 }
 
 async function load(frame) {
-  const control = new AbortController();
-  fetching.set(frame, control);
+  const control = new AbortController(), arrival = arrive(frame, control.signal);
+  fetching.set(frame, { control, arrival });
   try {
-    const path = `frames/${frame}.bin`;
-    const [bytes, key] = await Promise.all([
-      get(path, control.signal).then((answer) => answer.arrayBuffer()),
-      keyOf(owners[frame]),
-    ]);
-    tally(path);
-    const started = performance.now();
-    if (!control.signal.aborted) keep(frame, unpackFrame(bytes, key));
-    traffic.unpack_ms = performance.now() - started;
+    keep(frame, await arrival);
     if (failures) postMessage({ type: "problem", text: "" });
     failures = 0;
   } catch (error) {
     if (error instanceof LostError) lose([frame], error);
     else if (!control.signal.aborted) fail(error);
   } finally {
-    fetching.delete(frame);
+    if (fetching.get(frame)?.control === control) fetching.delete(frame);
     prefetch();
   }
+}
+
+async function arrive(frame, signal) {
+  const key = await keyOf(owners[frame]), parents = parentsOf(frame);
+  signal.throwIfAborted();
+  if (!parents.length) return keyFrame(key);
+  const bytes = await bytesOf(`frames/${frame}.bin`, signal);
+  const [, , , from] = new Uint32Array(bytes, 0, 4); // how many: one is the key, where a parent cannot be read
+  const known = from === 1 ? [keyFrame(key)] : await Promise.all(parents.map(arrived));
+  const started = performance.now(), entry = unpackFrame(bytes, key, known);
+  traffic.unpack_ms = performance.now() - started;
+  return entry;
+}
+
+async function arrived(frame) {
+  if (lost.has(frame)) throw new LostError(`frame ${frame}, from which others are predicted, is lost`);
+  const entry = frames.get(frame) ?? (await fetching.get(frame)?.arrival);
+  if (!entry) throw new Error(`frame ${frame}, from which others are predicted, is gone`);
+  return entry;
 }
 
 function fail(error) {
@@ -142,7 +207,7 @@ function keep(frame, entry) {
   frames.set(frame, entry);
   let bytes = 0;
   for (const kept of frames.values()) bytes += kept.bytes;
-  const near = new Set(upcoming());
+  const near = needed();
   for (const [old, kept] of frames) { // in order of arrival
     if (bytes <= BUDGET_BYTES) break;
     if (near.has(old)) continue;
@@ -159,78 +224,201 @@ function reportBuffer() {
   postMessage({ type: "buffered", map, ahead: ahead() }, [map.buffer]);
 }
 
+// The whole key of a segment. It is told to the page as its parts arrive; those that have arrived stay.
 function keyOf(segment) {
-  const known = keys.get(segment);
-  if (known) { keys.delete(segment); keys.set(segment, known); return known; } // youngest last
-  const path = `segments/${segment}.bin`;
-  const bytes = get(path).then((answer) => answer.arrayBuffer()).finally(() => tally(path));
-  const promise = bytes.then((body) => unpackKey(body, segment));
-  promise.catch((error) => {
-    keys.delete(segment);
-    if (error instanceof LostError) lose([...owners.keys()].filter((frame) => owners[frame] === segment), error);
+  const entry = keys.get(segment) ?? { key: null, whole: null, control: null };
+  keys.delete(segment);
+  keys.set(segment, entry); // youngest last
+  if (!entry.whole) begin(entry, segment);
+  return entry.whole;
+}
+
+function begin(entry, segment) {
+  entry.control = new AbortController();
+  const whole = entry.whole = complete(entry, segment, entry.control.signal).catch((error) => {
+    const { first, length } = scene.segments[segment];
+    if (error instanceof LostError) lose(Array.from({ length }, (_, k) => first + k), error);
+    else if (entry.whole === whole) entry.whole = null;
+    throw error;
   });
-  keys.set(segment, promise);
-  const needed = new Set([...upcoming().map((frame) => owners[frame]), sent.segment]);
-  for (const old of [...keys.keys()]) if (keys.size > KEPT_KEYS && !needed.has(old)) keys.delete(old);
-  return promise;
+}
+
+function forgetKeys() {
+  const needed = new Set();
+  const need = (segment) => {
+    if (needed.has(segment)) return;
+    needed.add(segment);
+    const reference = keys.get(segment)?.key?.reference ?? null;
+    if (reference !== null) need(reference);
+  };
+  [...upcoming().map((frame) => owners[frame]), sent.segment].forEach(need);
+  for (const [old, entry] of [...keys]) {
+    if (needed.has(old)) continue;
+    if (!entry.key?.base && entry.whole) { entry.control.abort(); entry.whole = null; } // its parts stay
+    if (keys.size > KEPT_KEYS) keys.delete(old);
+  }
+}
+
+async function complete(entry, segment, signal) {
+  const part = (number) => bytesOf(`segments/${segment}/${number}.bin`, signal);
+  const key = entry.key ?? (entry.key = beginKey(await part(0), segment));
+  grow(key);
+  if (key.reference !== null && !key.taken) {
+    takeRows(key, await keyOf(key.reference));
+    grow(key);
+  }
+  for (let number = key.arrived; number < key.parts; number++) {
+    fillPart(key, number, await part(number));
+    key.arrived = number + 1;
+    grow(key);
+  }
+  key.base = keyFrame(key);
+  return key;
+}
+
+function grow(key) {
+  key.version++;
+  postMessage({ type: "part", segment: key.segment });
 }
 
 // Layers of the UV map, by slot, of the segment that the page shows.
 async function tellLayers() {
   const { segment } = sent;
   if (segment < 0) return;
-  const [key, body] = await Promise.all([
-    keyOf(segment), get(`layers/${segment}.bin`).then((answer) => answer.arrayBuffer()),
-  ]);
-  const layers = new Uint8Array(key.slotCount);
-  new Uint8Array(body).forEach((layer, row) => { layers[key.slots[row]] = layer; });
+  const [key, body] = await Promise.all([keyOf(segment), bytesOf(`layers/${segment}.bin`)]);
+  const layers = new Uint8Array(key.slotCount), rows = new Uint8Array(body);
+  layers.set(rows.subarray(0, key.moving));
+  layers.set(rows.subarray(key.moving), WIDTH * key.rows);
   postMessage({ type: "layers", segment, layers }, [layers.buffer]);
 }
 
 // ---- unpacking: Gaussians go into slots, the dynamic ones first, so that a frame is one upload
 
-function unpackKey(bytes, segment) {
-  const [count, moving, columns] = new Uint32Array(bytes, 0, 3);
-  const xyz = new Uint16Array(bytes, 16, 3 * count);
-  const attributes = new Uint8Array(bytes, 16 + 6 * count, columns * count);
-  const dynamic = new Uint8Array(bytes, 16 + (6 + columns) * count, count);
+// Columns of `count` rows from a body: positions, if there are any, and attributes, without their filters.
+function readColumns(bytes, offset, count, columns, { positions = true, colours = COLOURS } = {}) {
+  const axes = positions ? 3 : 0, filters = new Uint8Array(bytes, offset, axes + columns);
+  let at = offset + axes + columns;
+  const plane = () => new Uint8Array(bytes, (at += count) - count, count);
+  const xyz = Array.from({ length: axes }, (_, axis) => unfold(plane(), plane(), filters[axis] & ROW_BEFORE));
+  const attributes = Array.from({ length: columns }, plane);
+  attributes.forEach((values, column) => {
+    if (filters[axes + column] & ROW_BEFORE) for (let row = 1; row < count; row++) values[row] += values[row - 1];
+  });
+  attributes.forEach((values, column) => {
+    if (!(filters[axes + column] & GREEN)) return;
+    const green = attributes[column - ((column - colours) % 3) + 1];
+    for (let row = 0; row < count; row++) values[row] += green[row];
+  });
+  return { xyz, attributes };
+}
+
+function unfold(high, low, differences) {
+  const values = new Uint16Array(high.length);
+  for (let row = 0, last = 0; row < values.length; row++) {
+    const folded = (high[row] << 8) | low[row], value = (folded >> 1) ^ -(folded & 1);
+    values[row] = last = differences ? last + value : value;
+  }
+  return values;
+}
+
+// Of a key that has just begun, what is not there yet is absent: opacity code 0.
+function beginKey(bytes, segment) {
+  const [count, moving, columns, reference, known, partRows, parts] = new Uint32Array(bytes, 0, 8);
+  const fates = new Uint8Array(bytes, 32, known);
   const rows = Math.ceil(moving / WIDTH);
   const slotCount = WIDTH * (rows + Math.ceil((count - moving) / WIDTH));
-  const slots = new Uint32Array(count);
-  let first = 0, second = WIDTH * rows;
-  for (let row = 0; row < count; row++) slots[row] = dynamic[row] ? first++ : second++;
   const packed = new ArrayBuffer(16 * layers * slotCount);
   const [x, y, z] = [0, 1, 2].map(() => new Float32Array(slotCount));
-  const key = { segment, count, moving, rows, slotCount, slots, packed, x, y, z, alive: new Uint8Array(slotCount) };
-  const shorts = new Uint16Array(packed), octets = new Uint8Array(packed);
-  for (let axis = 0; axis < 3; axis++) {
-    for (let row = 0; row < count; row++) shorts[8 * slots[row] + axis] = xyz[axis * count + row];
-  }
-  for (let column = 0; column < columns; column++) {
-    const at = place(column, slotCount), from = column * count;
-    for (let row = 0; row < count; row++) octets[at + 16 * slots[row]] = attributes[from + row];
-  }
-  decode(key, packed, slotCount, slotCount);
+  const taken = [1, 2].map((fate) => fates.reduce((sum, value) => sum + (value === fate), 0)); // still, moving
+  const key = {
+    segment, count, moving, rows, slotCount, packed, x, y, z, alive: new Uint8Array(slotCount), fates, partRows, parts,
+    reference: reference === NO_REFERENCE ? null : reference, taken: false, arrived: 1, version: 0, base: null,
+    bands: 1, own: { moving: taken[1], still: WIDTH * rows + taken[0], stillEnd: WIDTH * rows + count - moving },
+  };
+  fill(key, key.own.moving, readColumns(bytes, 32 + known, moving - key.own.moving, REST));
   return key;
 }
 
-function unpackFrame(bytes, key) {
+function takeRows(key, from) {
+  const { fates } = key;
+  let moving = 0, still = WIDTH * key.rows;
+  const texels = new Uint32Array(key.packed), others = new Uint32Array(from.packed);
+  for (let row = 0; row < fates.length; row++) {
+    if (!fates[row]) continue;
+    const slot = fates[row] === 2 ? moving++ : still++, other = row < from.moving ? row : WIDTH * from.rows + row - from.moving;
+    for (let layer = 0; layer < layers; layer++) {
+      const to = 4 * (layer * key.slotCount + slot), at = 4 * (layer * from.slotCount + other);
+      for (let word = 0; word < 4; word++) texels[to + word] = others[at + word];
+    }
+  }
+  decode(key, key.packed, key.slotCount, 0, moving);
+  decode(key, key.packed, key.slotCount, WIDTH * key.rows, still);
+  key.taken = true;
+}
+
+function fillPart(key, number, bytes) {
+  const { own, partRows } = key, degree = Math.sqrt((scene.columns - COLOURS) / 3) - 1;
+  const band = number - (key.parts - degree) + 1;
+  if (band > 0) return fillBand(key, band, bytes);
+  const start = own.still + (number - 1) * partRows;
+  fill(key, start, readColumns(bytes, 0, Math.min(own.stillEnd - start, partRows), REST));
+}
+
+function fillBand(key, band, bytes) {
+  const { own, moving } = key, first = REST + 3 * (band ** 2 - 1), columns = 3 * (2 * band + 1);
+  const movers = moving - own.moving, stills = own.stillEnd - own.still;
+  const { attributes } = readColumns(bytes, 0, movers + stills, columns, { positions: false, colours: 0 });
+  const octets = new Uint8Array(key.packed);
+  attributes.forEach((values, column) => {
+    const at = place(first + column, key.slotCount);
+    for (let row = 0; row < movers; row++) octets[at + 16 * (own.moving + row)] = values[row];
+    for (let row = 0; row < stills; row++) octets[at + 16 * (own.still + row)] = values[movers + row];
+  });
+  key.bands |= 1 << band;
+}
+
+// Puts rows into slots from `start` on.
+function fill(key, start, { xyz, attributes }) {
+  const shorts = new Uint16Array(key.packed), octets = new Uint8Array(key.packed), count = attributes[0].length;
+  xyz.forEach((values, axis) => {
+    for (let row = 0; row < count; row++) shorts[8 * (start + row) + axis] = values[row];
+  });
+  attributes.forEach((values, column) => {
+    const at = place(column, key.slotCount);
+    for (let row = 0; row < count; row++) octets[at + 16 * (start + row)] = values[row];
+  });
+  decode(key, key.packed, key.slotCount, start, start + count);
+}
+
+// The moving rows of a key, laid out as those of a frame.
+function keyFrame(key) {
+  if (key.base) return key.base;
+  const size = 16 * WIDTH * key.rows, packed = new Uint8Array(size * layers);
+  for (let layer = 0; layer < layers; layer++) {
+    packed.set(new Uint8Array(key.packed, 16 * layer * key.slotCount, size), layer * size);
+  }
+  return { segment: key.segment, packed: packed.buffer, bytes: packed.byteLength };
+}
+
+// What a frame's parents foretell, and what they do not; both wrap as the codes do.
+function unpackFrame(bytes, key, [before, after]) {
   const [segment, moving, columns] = new Uint32Array(bytes, 0, 3);
   if (segment !== key.segment || moving !== key.moving) throw new Error("the scene changed on disk; reload the page");
-  const xyz = new Uint16Array(bytes, 16, 3 * moving);
-  const attributes = new Uint8Array(bytes, 16 + 6 * moving, columns * moving);
-  const slotCount = WIDTH * key.rows;
-  const packed = new ArrayBuffer(16 * layers * slotCount);
-  const shorts = new Uint16Array(packed), octets = new Uint8Array(packed); // both wrap as the codes do
-  const keyShorts = new Uint16Array(key.packed), keyOctets = new Uint8Array(key.packed);
-  for (let axis = 0; axis < 3; axis++) {
-    const from = axis * moving;
-    for (let row = 0; row < moving; row++) shorts[8 * row + axis] = keyShorts[8 * row + axis] + xyz[from + row];
-  }
-  for (let column = 0; column < columns; column++) {
-    const at = place(column, slotCount), keyAt = place(column, key.slotCount), from = column * moving;
-    for (let row = 0; row < moving; row++) octets[at + 16 * row] = keyOctets[keyAt + 16 * row] + attributes[from + row];
-  }
+  const { xyz, attributes } = readColumns(bytes, 16, moving, columns);
+  const slotCount = WIDTH * key.rows, packed = before.packed.slice(0);
+  const shorts = new Uint16Array(packed), octets = new Uint8Array(packed);
+  const nextShorts = after && new Uint16Array(after.packed), nextOctets = after && new Uint8Array(after.packed);
+  xyz.forEach((values, axis) => {
+    for (let row = 0, at = axis; row < moving; row++, at += 8) {
+      const way = after ? ((((nextShorts[at] - shorts[at]) << 16) >> 16) + 1) >> 1 : 0;
+      shorts[at] += way + values[row];
+    }
+  });
+  attributes.forEach((values, column) => {
+    for (let row = 0, at = place(column, slotCount); row < moving; row++, at += 16) {
+      octets[at] = (after ? (octets[at] + nextOctets[at] + 1) >> 1 : octets[at]) + values[row];
+    }
+  });
   return { segment, packed, bytes: packed.byteLength };
 }
 
@@ -240,12 +428,10 @@ function place(column, slotCount) {
   return 16 * slotCount * (byte >> 4) + (byte & 15);
 }
 
-const OPACITY = 6;
-
-// World positions of the first `slotCount` slots, for the sort. Opacity code 0 marks an absent Gaussian.
-function decode(key, packed, slotCount, used) {
+// World positions of slots from `start` to `end`, for the sort. Opacity code 0 marks an absent Gaussian.
+function decode(key, packed, slotCount, start, end) {
   const shorts = new Uint16Array(packed), octets = new Uint8Array(packed), opacity = place(OPACITY, slotCount);
-  for (let slot = 0; slot < used; slot++) {
+  for (let slot = start; slot < end; slot++) {
     key.x[slot] = tables[shorts[8 * slot]];
     key.y[slot] = tables[65536 + shorts[8 * slot + 1]];
     key.z[slot] = tables[131072 + shorts[8 * slot + 2]];
@@ -256,29 +442,39 @@ function decode(key, packed, slotCount, used) {
 // ---- showing
 
 // Answers with the draw order for a view, and with the codes that the page does not hold yet. A frame that has not
-// arrived leaves the one on screen.
+// arrived leaves the one on screen; as long as there is none, what has arrived of the key of its segment is shown.
 async function show({ frame, eye, forward, near, spare }) {
   let entry = frames.get(frame);
-  if (!entry && sent.frame >= 0) { frame = sent.frame; entry = frames.get(frame); }
+  if (!entry && sent.frame < 0) return showPart(keys.get(owners[frame])?.key, { eye, forward, near, spare });
+  if (!entry) { frame = sent.frame; entry = frames.get(frame); }
   const segment = entry ? entry.segment : sent.segment;
-  if (segment < 0) return postMessage({ type: "miss" });
   const key = await keyOf(segment);
-  const transfer = [], answer = { type: "picture", frame, segment, count: key.count, moving: key.moving };
-  if (segment !== sent.segment) {
-    answer.key = { packed: key.packed.slice(0), slotCount: key.slotCount };
-    transfer.push(answer.key.packed);
+  const codes = [];
+  if (segment !== sent.segment || key.version !== sent.version) codes.push(keyCodes(key));
+  if (entry && (codes.length || frame !== sent.frame)) {
+    decode(key, entry.packed, WIDTH * key.rows, 0, key.moving);
+    codes.push({ frame_codes: { packed: entry.packed.slice(0), rows: key.rows } });
   }
-  if (entry && (segment !== sent.segment || frame !== sent.frame)) {
-    decode(key, entry.packed, WIDTH * key.rows, key.moving);
-    answer.frame_codes = { packed: entry.packed.slice(0), rows: key.rows };
-    transfer.push(answer.frame_codes.packed);
-  }
-  sent = { segment, frame };
-  const started = performance.now();
-  Object.assign(answer, order(key, eye, forward, near, spare));
-  answer.sort_ms = performance.now() - started;
-  answer.traffic = { ...traffic };
-  postMessage(answer, [...transfer, answer.order.buffer]);
+  sent = { segment, frame, version: key.version };
+  answer(key, Object.assign({ frame }, ...codes), { eye, forward, near, spare });
+}
+
+function showPart(key, view) {
+  if (!key) return postMessage({ type: "miss" });
+  const codes = key.segment !== sent.segment || key.version !== sent.version ? keyCodes(key) : {};
+  sent = { segment: key.segment, frame: -1, version: key.version };
+  answer(key, { ...codes, frame: -1 }, view);
+}
+
+function keyCodes(key) { return { key: { packed: key.packed.slice(0), slotCount: key.slotCount } }; }
+
+function answer(key, told, { eye, forward, near, spare }) {
+  const { segment, count, moving, bands } = key, started = performance.now();
+  const picture = { type: "picture", segment, count, moving, bands, ...told, ...order(key, eye, forward, near, spare) };
+  picture.sort_ms = performance.now() - started;
+  picture.traffic = { ...traffic };
+  const codes = [told.key, told.frame_codes].filter(Boolean).map(({ packed }) => packed);
+  postMessage(picture, [...codes, picture.order.buffer]);
 }
 
 // Far to near by a counting sort. The bin is the top of the float's own bits: 4096 steps per octave of depth, 16

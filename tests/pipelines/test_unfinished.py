@@ -175,10 +175,10 @@ def test_a_page_learns_of_more_and_its_old_numbers_are_over(fitting):
         with contextlib.ExitStack() as stack:
             stack.callback(server.shutdown)
             assert scene(server) == (0, 1)
-            assert status(server, "frames/0.bin?made=0") == 200
+            assert status(server, "layers/0.bin?made=0") == 200
             fitting.segment(0, 5)
             assert scene(server) == (1, 5)
-            assert status(server, "frames/0.bin?made=0") == 410
+            assert status(server, "layers/0.bin?made=0") == 410
             assert status(server, "frames/4.bin?made=1") == 200
 
 

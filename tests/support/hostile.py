@@ -39,7 +39,7 @@ from packuv.scene import SceneHeader, open_scene, verify_scene, write_scene
 from packuv.scene.header import CHECKSUM, HEADER
 from packuv.scene.lookahead import DamageError
 from packuv.scene.matroska import Packet, VideoTrack, write_matroska
-from packuv.viewer.source import SceneSource, describe, tables_bytes
+from packuv.viewer.source import SceneSource, describe
 from tests.support.splats import ksplat_bytes, random_gaussians, splat_bytes
 
 SECONDS, EXTRA_BYTES = 2.0, 300 << 20
@@ -169,7 +169,6 @@ def read_scene(path: Path) -> None:
     with open_scene(path, threads=1) as scene:
         source = SceneSource(scene)
         json.dumps(describe(source), allow_nan=False)
-        tables_bytes(source.quantizer)
         assert all(camera.matrix.shape == (3, 3) for camera in scene.header.cameras)
         assert scene.header.near > 0
         assert np.abs(scene.header.light).max() <= MOST_LIGHT

@@ -28,7 +28,9 @@ from packuv.gaussians.segment import Segment
 from packuv.raster import RasterOptions, render
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.scene.mosaic import NEUTRAL
+from packuv.viewer.bodies import Bodies
 from packuv.viewer.folder import WebOptions, checksum, read_deltas, read_index, read_video, write_web
+from packuv.viewer.source import SceneSource
 from packuv.viewer.streams import (
     MOST_PIXELS,
     Sheet,
@@ -175,12 +177,13 @@ def test_streams_give_back_every_byte_and_name_their_packets(codec):
 @pytest.mark.parametrize("codec", list(WebCodec))
 def test_both_forms_give_back_every_frame(scene_path, sites, codec):
     with open_scene(scene_path) as scene:
+        checks, bodies = json.loads((sites[codec] / "video.json").read_text())["crc32"], Bodies(SceneSource(scene))
         forms = zip(read_video(sites[codec]), read_deltas(sites[codec]), strict=True)
         for frame, (video, deltas) in enumerate(forms):
             truth = scene.codes(frame)
             assert same(video, truth)
-            assert same(deltas, truth)
-            assert read_index(sites[codec])["crc32"][frame] == checksum(truth)
+            assert same(deltas, bodies.codes(frame))
+            assert checks[frame] == checksum(truth)
         assert frame == 5
 
 
@@ -196,14 +199,14 @@ def test_a_scene_in_which_nothing_moves_and_one_with_high_bands(tmp_path, shape)
 def test_the_folder_is_whole_or_absent(scene_path, sites, tmp_path):
     steps = []
     summary = write_web(scene_path, tmp_path / "a", options=WebOptions(), progress=lambda *step: steps.append(step))
-    assert steps[-1] == (18, 18)
+    assert steps[-1] == (24, 24)
     assert summary.bytes == sum(path.stat().st_size for path in (tmp_path / "a").iterdir())
     with pytest.raises(FileExistsError, match="must be new or an empty folder"):
         write_web(scene_path, tmp_path / "a", options=WebOptions())
     with pytest.raises(FileNotFoundError):
         write_web(tmp_path / "none.mkv", tmp_path / "b", options=WebOptions())
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
-    for name in ("index.json", "key.ivf", "delta.ivf", "segment00000.bin", "scene.json", "tables.bin"):
+    for name in ("index.json", "key.ivf", "delta.ivf", "segment00000.bin", "scene.json", "video.json"):
         assert (tmp_path / "a" / name).read_bytes() == (
             sites[WebCodec.VP9] / name
         ).read_bytes()  # same scene, same bytes
@@ -215,9 +218,9 @@ def test_damage_is_told(sites, tmp_path, file):
     content = (folder / file).read_bytes()
     (folder / file).write_bytes(content[:60] + bytes(len(content) - 60))
     read = read_deltas if file.startswith("segment") else read_video
-    index = read_index(folder)
     try:
-        wrong = [frame for frame, codes in enumerate(read(folder)) if checksum(codes) != index["crc32"][frame]]
+        before = zip(read(sites[WebCodec.VP9]), read(folder), strict=True)
+        wrong = [frame for frame, pair in enumerate(before) if not same(*pair)]
     except (ValueError, OSError) as error:
         wrong = [str(error)]
     assert wrong
@@ -232,7 +235,7 @@ def test_only_a_scene_whose_light_changes_says_so(sites, tmp_path):
     told, plain = (json.loads((folder / "scene.json").read_text()) for folder in (tmp_path / "a", sites[WebCodec.VP9]))
     assert np.array_equal(told.pop("light"), light)
     assert told == plain
-    for name in ("index.json", "key.ivf", "delta.ivf", "segment00000.bin", "tables.bin"):
+    for name in ("index.json", "key.ivf", "delta.ivf", "segment00000.bin", "video.json"):
         assert (tmp_path / "a" / name).read_bytes() == (sites[WebCodec.VP9] / name).read_bytes()  # codes are steady
 
 
@@ -327,9 +330,9 @@ def test_the_page_in_a_folder_shows_a_frame_in_its_light(browser, tmp_path):
 
 SUMS = """
 (async () => {
-  const index = await (await fetch("index.json")).json(), sums = {};
+  const video = await (await fetch("video.json")).json(), sums = {};
   for (const name of ["key", "delta"]) {
-    const stream = index.video[name], bytes = await (await fetch(stream.file)).arrayBuffer(), pictures = [];
+    const stream = video[name], bytes = await (await fetch(stream.file)).arrayBuffer(), pictures = [];
     const fail = (error) => { window.sums = String(error); };
     const decoder = new VideoDecoder({ error: fail, output: (frame) => pictures.push(sum(frame, stream)) });
     decoder.configure({ codec: stream.codec, codedWidth: stream.width, codedHeight: stream.height });
@@ -358,11 +361,11 @@ SUMS = """
 @pytest.mark.slow
 @pytest.mark.parametrize("codec", list(WebCodec))
 def test_chromium_decodes_the_streams_bit_by_bit(browser, sites, codec):
-    index = read_index(sites[codec])
+    video = json.loads((sites[codec] / "video.json").read_text())
     wanted = {}
     for name in ("key", "delta"):
-        with (sites[codec] / index["video"][name]["file"]).open("rb") as file:
-            pictures = read_stream(file, index["video"][name], codec)
+        with (sites[codec] / video[name]["file"]).open("rb") as file:
+            pictures = read_stream(file, video[name], codec)
             wanted[name] = [hashlib.sha256(picture.tobytes()).hexdigest() for picture in pictures]
     assert (len(wanted["key"]), len(wanted["delta"])) == (3, 3)
     with served(sites[codec], ranges=True) as (address, _):
@@ -376,10 +379,10 @@ def test_chromium_decodes_the_streams_bit_by_bit(browser, sites, codec):
 @pytest.mark.parametrize("ranges", [True, False])
 def test_damaged_bytes_of_a_folder_cost_their_frame(browser, sites, tmp_path, ranges):
     site = shutil.copytree(sites[WebCodec.VP9], tmp_path / "site")
-    file, offset, size = read_index(site)["bodies"]["frames/4.bin"]
-    body = bytearray((site / file).read_bytes())
-    body[offset + size // 2] ^= 0x55
-    (site / file).write_bytes(body)
+    entry = read_index(site)["segments"][1]  # frames 3 and 4
+    body = bytearray((site / entry["file"]).read_bytes())
+    body[-entry["frames"][-1] // 2] ^= 0x55
+    (site / entry["file"]).write_bytes(body)
     with served(site, ranges=ranges) as (address, _):
         browser.open(address + "#play=0&frame=3", 160, 120)
         browser.wait_for("document.documentElement.dataset.lost == 1 && document.documentElement.dataset.frame == 3")

@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 import urllib.request
 import zlib
@@ -19,6 +18,7 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 from packuv.camera import PinholeCamera
 from packuv.colour import lit
 from packuv.film import CameraPath
-from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
+from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, attribute_count
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
 from packuv.gaussians.uvmap import assign_slots
@@ -37,91 +37,39 @@ from packuv.raster import RasterOptions, render
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.viewer import serve
 from packuv.viewer import server as viewer_server
+from packuv.viewer.bodies import PART_ROWS, SPAN, Bodies, importance, parents
 from packuv.viewer.server import MOST_CONNECTIONS, PAGES, ViewerServer
 from packuv.viewer.source import (
     SegmentSource,
     Source,
     describe,
-    frame_bytes,
-    key_bytes,
-    layer_bytes,
     near_plane,
     open_source,
-    tables_bytes,
 )
 from tests.support.browser import Browser, running_browser
+from tests.support.page import Page, tables_of
+from tests.support.viewed import make_quantizer, make_ring, make_segment, make_source, running
 
 NEAR = RasterOptions(near=0.1)
 PAGE_FOLDER = Path(viewer_server.__file__).parent
 
 
-def make_quantizer(sh_degree: int = 0) -> Quantizer:
-    count = attribute_count(sh_degree)
-    low, high = np.full(count, -1.5), np.full(count, 1.5)
-    low[:3], high[:3] = -4.5, -1.5  # natural log of the scales
-    low[3:6], high[3:6] = -1, 1
-    low[6], high[6] = OPACITY_RANGE
-    return Quantizer(np.array([0.3, -0.2, 0.1]), 1.0, np.array([2.0, 2.0, 2.0]), low, high, sh_degree)
+def page_of(source: Source) -> Page:
+    """What a page makes of the bodies of a source."""
+    bodies = Bodies(source)
+
+    def get(address: str) -> bytes:
+        what, *numbers = address.removesuffix(".bin").split("/")
+        make = {"segments": bodies.part, "frames": bodies.frame}[what]
+        return zlib.decompress(make(*map(int, numbers)))
+
+    return Page(describe(source), get)
 
 
-def make_segment(
-    rng: np.random.Generator, first: int, *, length: int, count: int, dynamic: float, columns: int
-) -> Segment:
-    moves = rng.random(count) < dynamic
-    shape = (length - 1, int(moves.sum()))
-    key = Codes(
-        rng.integers(0, 65536, (count, 3), dtype=np.uint16), rng.integers(0, 256, (count, columns), dtype=np.uint8)
-    )
-    xyz = rng.integers(0, 65536, (*shape, 3), dtype=np.uint16)
-    return Segment(first, key, moves, xyz, rng.integers(0, 256, (*shape, columns), dtype=np.uint8))
-
-
-def make_ring(count: int = 4, width: int = 160, height: int = 120) -> tuple[PinholeCamera, ...]:
-    cameras = []
-    for index, angle in enumerate(np.arange(count) * 2 * np.pi / count):
-        eye = np.array([5 * np.sin(angle), -1.0, 5 * np.cos(angle)])
-        forward = -eye / np.linalg.norm(eye)
-        right = np.cross([0.0, 1.0, 0.0], forward)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = [right, np.cross(forward, right), forward]
-        pose[:3, 3] = -pose[:3, :3] @ eye
-        cameras.append(PinholeCamera(f"cam{index}", width, height, 150.0, 140.0, width / 2 + 7, height / 2 - 4, pose))
-    return tuple(cameras)
-
-
-def make_source(sh_degree: int = 0, *, count: int = 300, dynamic: float = 0.3) -> SegmentSource:
-    rng = np.random.default_rng(5)
-    columns = attribute_count(sh_degree)
-    parts = [
-        make_segment(rng, first, length=length, count=count, dynamic=dynamic, columns=columns)
-        for first, length in ((0, 4), (4, 1), (5, 3))
-    ]
-    return SegmentSource(
-        tuple(parts), make_quantizer(sh_degree), Fraction(30000, 1001), make_ring(), held_out=frozenset({"cam2"})
-    )
-
-
-def read_key(body: bytes) -> tuple[Codes, np.ndarray]:
-    """The page's side of `key_bytes`, written from docs/viewer.md."""
-    count, moving, columns, _ = np.frombuffer(body, "<u4", 4)
-    xyz = np.frombuffer(body, "<u2", 3 * count, 16).reshape(3, count)
-    attributes = np.frombuffer(body, np.uint8, columns * count, 16 + 6 * count).reshape(columns, count)
-    dynamic = np.frombuffer(body, np.uint8, count, 16 + (6 + columns) * count).astype(bool)
-    assert dynamic.sum() == moving
-    assert len(body) == 16 + (7 + columns) * count
-    return Codes(xyz.T.astype(np.uint16), attributes.T), dynamic
-
-
-def read_frame(body: bytes, keys: list[tuple[Codes, np.ndarray]]) -> Codes:
-    """The page's side of `frame_bytes`: the whole frame, the keyframe's static rows included."""
-    segment, moving, columns, _ = np.frombuffer(body, "<u4", 4)
-    key, dynamic = keys[segment]
-    xyz, attributes = key.xyz.copy(), key.attributes.copy()
-    xyz[dynamic] += np.frombuffer(body, "<u2", 3 * moving, 16).reshape(3, moving).T
-    attributes[dynamic] += np.frombuffer(body, np.uint8, columns * moving, 16 + 6 * moving).reshape(columns, moving).T
-    assert len(body) == 16 + (6 + columns) * moving
-    return Codes(xyz, attributes)
+def assert_same_rows(left: Codes, right: Codes) -> None:
+    """In any order."""
+    rows = [np.concatenate([codes.xyz, codes.attributes], axis=1) for codes in (left, right)]
+    assert np.array_equal(*(row[np.lexsort(row.T)] for row in rows))
 
 
 def assert_same(left: Codes, right: Codes) -> None:
@@ -149,21 +97,109 @@ def test_what_is_sent_decodes_to_the_codes(
         parts.append(make_segment(rng, instant, length=length, count=count, dynamic=dynamic, columns=columns))
         instant += length
     source = SegmentSource(tuple(parts), make_quantizer(sh_degree))
-    keys = [read_key(key_bytes(source, number)) for number in range(len(parts))]
-    wanted = [part.frame(offset) for part in parts for offset in range(len(part))]
-    for frame, codes in enumerate(wanted):
-        assert_same(read_frame(frame_bytes(source, frame), keys), codes)
-    for (key, mask), part in zip(keys, parts, strict=True):
-        assert_same(key, part.key)
-        assert np.array_equal(mask, part.dynamic)
+    page, bodies = page_of(source), Bodies(source)
+    for frame, codes in enumerate(part.frame(offset) for part in parts for offset in range(len(part))):
+        got = page.frame(frame)
+        assert_same_rows(got, codes)
+        assert_same(got, bodies.codes(frame))
+    for number, part in enumerate(parts):
+        assert page.key(number)[1] == part.dynamic.sum()
 
 
-def test_the_tables_are_the_quantizers() -> None:
-    quantizer = make_quantizer(1)
-    values = np.frombuffer(tables_bytes(quantizer), "<f4")
-    positions, attributes = np.split(values, [3 * 65536])
-    assert np.array_equal(positions.reshape(3, 65536), quantizer.xyz_table)
-    assert np.array_equal(attributes.reshape(-1, 256), quantizer.attribute_table)
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 60), sh_degree=st.integers(0, 2))
+def test_rows_that_an_earlier_key_has_are_taken_from_there(seed: int, count: int, sh_degree: int) -> None:
+    """Rows that stay still, begin to move, cease to, and are gone, through two references; some are equal."""
+    rng, columns, parts = np.random.default_rng(seed), attribute_count(sh_degree), []
+    for number in range(3):
+        part = make_segment(rng, 2 * number, length=2, count=count, dynamic=0.4, columns=columns)
+        if number:
+            kept = rng.random(count) < 0.7
+            part.key.xyz[kept], part.key.attributes[kept] = parts[-1].key.xyz[kept], parts[-1].key.attributes[kept]
+            part.key.xyz[:2], part.key.attributes[:2] = part.key.xyz[:1], part.key.attributes[:1]
+        parts.append(part)
+
+    class Shared(SegmentSource):
+        def reference(self, segment: int) -> int | None:
+            return segment - 1 if segment else None
+
+    page = page_of(Shared(tuple(parts), make_quantizer(sh_degree)))
+    for frame in (5, 0, 2, 3, 4, 1):
+        assert_same_rows(page.frame(frame), parts[frame // 2].frame(frame % 2))
+
+
+@pytest.mark.parametrize("length", range(1, 40))
+def test_a_frame_needs_few_others_and_few_need_it(length: int) -> None:
+    def way(offset: int) -> set[int]:
+        return {offset}.union(*(way(parent) for parent in parents(offset, length)))
+
+    ways = [way(offset) for offset in range(length)]
+    assert max(map(len, ways)) <= 6  # the key, two that need it alone, and two steps of halving before its own
+    for offset in range(1, length):
+        heirs = [heir for heir in range(length) if offset in ways[heir]]
+        assert max(abs(heir - offset) for heir in heirs) < SPAN
+    alone = [offset for offset in range(1, length) if sum(offset in known for known in ways) == 1]
+    assert len(alone) >= (length - 1) // 3
+
+
+def test_what_moves_comes_first_and_then_what_is_large_and_opaque() -> None:
+    source = make_source(1, count=40000)
+    bodies, page = Bodies(source), page_of(source)
+    codes, dynamic = page.key(0)
+    weights = importance(codes, source.quantizer)[dynamic:]
+    assert dynamic == source.parts[0].dynamic.sum()
+    turns = [weights[start : start + PART_ROWS] for start in range(0, len(weights), PART_ROWS)]
+    assert len(turns) == 2
+    assert turns[0].min() >= turns[1].max()
+    assert bodies.parts(0) == 1 + len(turns) + 1  # the band of view dependence last
+    sizes = [len(bodies.part(0, number)) for number in range(4)]
+    assert sizes[0] < 1.05 * dynamic * 16
+    with pytest.raises(IndexError):
+        bodies.part(0, 4)
+
+
+def test_bodies_are_made_once() -> None:
+    class Counted(SegmentSource):
+        asked = 0
+
+        def moving(self, frame: int) -> Codes:
+            Counted.asked += 1
+            return super().moving(frame)
+
+    bodies = Bodies(Counted(make_source().parts, make_quantizer()))
+    first = bodies.frame(2)
+    asked = Counted.asked
+    assert bodies.frame(2) is first
+    assert Counted.asked == asked
+
+
+def test_a_damaged_frame_of_a_file_costs_no_other_its_prediction() -> None:
+    """Frame 8 is what 1 to 7 and 9 to 15 are predicted from, if it can be read."""
+
+    class Damaged(SegmentSource):
+        def moving(self, frame: int) -> Codes:
+            if frame == 8:
+                raise ValueError("packet 7 is damaged")
+            return super().moving(frame)
+
+    part = make_segment(np.random.default_rng(1), 0, length=18, count=30, dynamic=0.5, columns=10)
+    source = Damaged((part,), make_quantizer())
+    page = page_of(source)
+    for frame in range(18):
+        if frame != 8:
+            assert_same_rows(page.frame(frame), part.frame(frame))
+    with pytest.raises(ValueError, match="packet 7"):
+        page.frame(8)
+
+
+def test_the_page_rebuilds_the_quantizers_tables() -> None:
+    for reach, unit in ((2.0, 1.0), (0.3, 7.0), (9e4, 1e-3)):
+        quantizer = replace(make_quantizer(1), reach=np.full(3, reach) * [1, 1.3, 0.9], unit=unit)
+        told = json.loads(json.dumps(describe(replace(make_source(1), quantizer=quantizer))))
+        positions, attributes = tables_of(told)
+        assert np.array_equal(positions, quantizer.xyz_table)
+        assert np.array_equal(attributes, quantizer.attribute_table)
+        assert len(told["tables"]["except"]) < 1000  # most where the centre lies at the very end of an axis
 
 
 def test_segments_must_follow_one_another() -> None:
@@ -201,10 +237,9 @@ def scene_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5, 6, 7), (7, 6, 5, 4, 3, 2, 1, 0), (3, 1, 6, 0, 2, 7, 5, 4)])
 def test_a_scene_file_gives_its_codes_in_any_order(scene_path: Path, order: tuple[int, ...]) -> None:
     with open_source(scene_path) as source, open_scene(scene_path) as scene:
-        keys = {number: read_key(key_bytes(source, number)) for number in (2, 0, 1)}
+        page = page_of(source)
         for frame in order:
-            got = read_frame(frame_bytes(source, frame), [keys[number] for number in range(3)])
-            assert_same(got, scene.codes(frame))
+            assert_same_rows(page.frame(frame), scene.codes(frame))
 
 
 def test_a_scene_file_describes_itself_like_its_segments(scene_path: Path) -> None:
@@ -241,18 +276,6 @@ def test_serve_answers_until_it_is_interrupted(scene_path: Path) -> None:
 # ---- server
 
 
-@contextlib.contextmanager
-def running(source: Source) -> Iterator[ViewerServer]:
-    with ViewerServer(("127.0.0.1", 0), source) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield server
-        finally:
-            server.shutdown()
-            thread.join()
-
-
 def fetch(
     server: ViewerServer, path: str, *, method: str = "GET", **headers: str
 ) -> tuple[http.client.HTTPResponse, bytes]:
@@ -268,13 +291,13 @@ def fetch(
 def test_every_frame_arrives_exactly(encoding: str) -> None:
     source = make_source(1)
     with running(source) as server:
-        bodies = [fetch(server, f"/segments/{n}.bin", **{"Accept-Encoding": encoding})[1] for n in range(3)]
-        keys = [read_key(body) for body in bodies]
+        header = {"Accept-Encoding": encoding}
+        page = Page(describe(source), lambda address: fetch(server, f"/{address}", **header)[1])
         for frame in range(8):
-            answer, body = fetch(server, f"/frames/{frame}.bin", **{"Accept-Encoding": encoding})
-            assert answer.getheader("Content-Encoding") == ("deflate" if "deflate" in encoding else None)
             part = source.parts[(0, 0, 0, 0, 1, 2, 2, 2)[frame]]
-            assert_same(read_frame(body, keys), part.frame(frame - part.first))
+            assert_same_rows(page.frame(frame), part.frame(frame - part.first))
+        answer, _ = fetch(server, "/frames/1.bin", **header)
+        assert answer.getheader("Content-Encoding") == ("deflate" if "deflate" in encoding else None)
 
 
 def test_scene_json_names_frames_and_cameras() -> None:
@@ -283,14 +306,19 @@ def test_scene_json_names_frames_and_cameras() -> None:
     assert [(s["first"], s["length"]) for s in told["segments"]] == [(0, 4), (4, 1), (5, 3)]
     assert [camera["held_out"] for camera in told["cameras"]] == [False, False, True, False]
     assert PinholeCamera.from_json(told["cameras"][1]).name == "cam1"
-    assert told["times_ns"] == [index * 1001 * 10**9 // 30000 for index in range(8)]
+    assert np.cumsum([0, *told["steps_ns"]]).tolist() == [index * 1001 * 10**9 // 30000 for index in range(8)]
 
 
 @pytest.mark.parametrize(
     "path",
     [
         "/frames/8.bin",
-        "/segments/3.bin",
+        "/segments/3/0.bin",
+        "/segments/0/2.bin",
+        "/segments/0.bin",
+        "/frames/1/0.bin",
+        "/frames/0.bin",
+        "/tables.bin",
         "/frames/-1.bin",
         "/frames/01.bin",
         "/frames/99999999999.bin",
@@ -318,8 +346,8 @@ def test_head_tells_the_size_and_sends_nothing() -> None:
 
 def test_a_site_that_points_its_name_here_reads_nothing() -> None:
     with running(make_source()) as server:
-        assert fetch(server, "/frames/0.bin", Host="attacker.example:80")[0].status == 403
-        assert fetch(server, "/frames/0.bin", Host="localhost:1234")[0].status == 200
+        assert fetch(server, "/frames/1.bin", Host="attacker.example:80")[0].status == 403
+        assert fetch(server, "/frames/1.bin", Host="localhost:1234")[0].status == 200
 
 
 def test_damage_reaches_the_page_as_words() -> None:
@@ -761,15 +789,50 @@ def test_the_page_writes_camera_paths_that_films_read(browser: Browser, tmp_path
         assert np.allclose(view.camera.camera_from_world, camera.camera_from_world, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_the_page_films_a_path_as_films_do(browser: Browser, tmp_path: Path) -> None:
+    """Cameras and frames are those of `packuv film`; the pictures are the page's, coded with loss."""
+    source = replace(make_source(count=2000), near=0.1)
+    with running(source) as server:
+        shown_at(browser, server, "play=0&frame=0&camera=cam0&background=0,0,0", 320, 240, 0)
+        press(browser, "k")
+        press(browser, "]")
+        press(browser, "End")
+        browser.wait_for("document.documentElement.dataset.frame == 7")
+        browser.wait_for("document.querySelector('#cameras [aria-current=true]').dataset.camera == 'cam1'")
+        time.sleep(1)  # it has flown there
+        for key in ("k", "j", "g"):
+            press(browser, key)
+        (tmp_path / "path.json").write_text(browser.evaluate("document.documentElement.dataset.path"))
+        browser.wait_for("globalThis.filmed !== undefined")
+        browser.evaluate("filmed.arrayBuffer().then((bytes) => { window.bytes = [...new Uint8Array(bytes)]; })")
+        browser.wait_for("window.bytes !== undefined")
+        (tmp_path / "film.mp4").write_bytes(bytes(browser.evaluate("bytes")))
+    path = CameraPath.load(tmp_path / "path.json")
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        stream = film.streams.video[0]
+        assert (stream.width, stream.height, stream.average_rate) == (160, 120, source.rate)
+        pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(stream)]
+    assert len(pictures) == int(path.seconds * source.rate) + 1
+    for number in (0, 20, 41, len(pictures) - 1):
+        frame, camera = path.at(float(number / source.rate))
+        part = source.parts[0 if frame < 4 else 1 if frame == 4 else 2]
+        drawn = render(source.quantizer.decode(part.frame(frame - part.first)), camera, options=NEAR).colour
+        error = pictures[number] / 255 - np.clip(drawn.transpose(1, 2, 0), 0, 1)
+        assert -10 * np.log10(np.mean(error**2)) > 20, number  # of noise, by H.264 with chroma at half size
+
+
 def test_layers_are_those_of_the_atlas() -> None:
     source = make_source(count=3000)
     with running(source) as server:
         assert json.loads(fetch(server, "/scene.json")[1])["layers"] == UvOptions().layers
         for number, part in enumerate(source.parts):
             layers = np.frombuffer(fetch(server, f"/layers/{number}.bin")[1], np.uint8)
-            opacity = part.key.attributes[:, OPACITY]
+            key = server.bodies.codes(part.first)
+            assert_same_rows(key, part.key)
+            opacity = key.attributes[:, OPACITY]
             shown = opacity > 0
-            points = source.quantizer.decode(part.key[shown]).means
+            points = source.quantizer.decode(key[shown]).means
             slots = assign_slots(points, opacity[shown], source.quantizer.centre, options=UvOptions())
             assert np.array_equal(layers[shown], slots.layer + 1)
             assert not layers[~shown].any()
@@ -787,7 +850,7 @@ def test_the_page_colours_by_layer(browser: Browser) -> None:
     values = points, np.full((2, 3), -1.6), still, opacity, np.zeros((2, 1, 3))
     codes = source.quantizer.encode(Gaussians(*(value.astype(np.float32) for value in values)))
     part = Segment(0, codes, np.zeros(2, bool), np.empty((0, 0, 3), np.uint16), np.empty((0, 0, 10), np.uint8))
-    taken = np.frombuffer(layer_bytes(replace(source, parts=(part,)), 0), np.uint8)
+    taken = np.frombuffer(zlib.decompress(Bodies(replace(source, parts=(part,))).layers(0)), np.uint8)
     with running(replace(source, parts=(part,), cameras=(camera,), near=0.1)) as server:
         shown_at(browser, server, "play=0&frame=0&bare=1&mode=layer&background=0,0,0", camera.width, camera.height, 0)
         browser.wait_for("document.documentElement.dataset.layers == 0")
