@@ -265,7 +265,8 @@ function placeTruth([left, top, width, height]) {
   const sides = { left: left / density + aside, top: top / density, width: width / density, height: height / density };
   for (const [side, value] of Object.entries(sides)) picture.style[side] = `${value}px`;
   picture.style.opacity = truth.mode === "over" ? at("share").value : 1;
-  fetchTruth(`truth/${encodeURIComponent(camera)}/${player.shown}.png`);
+  const state = scene.made === undefined ? "" : `?made=${scene.made}`; // of what grows, whose frames get other numbers
+  fetchTruth(`truth/${encodeURIComponent(camera)}/${player.shown}.png${state}`);
 }
 
 function fetchTruth(address) { // one at a time; what plays on meanwhile is shown next
