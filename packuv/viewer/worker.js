@@ -333,8 +333,18 @@ function beginKey(bytes, segment) {
     reference: reference === NO_REFERENCE ? null : reference, taken: false, arrived: 1, version: 0, base: null,
     bands: 1, own: { moving: taken[1], still: WIDTH * rows + taken[0], stillEnd: WIDTH * rows + count - moving },
   };
-  fill(key, key.own.moving, readColumns(bytes, 32 + known, moving - key.own.moving, REST));
+  key.turns = turnsOf(key);
+  const [start, end] = key.turns[0];
+  fill(key, start, readColumns(bytes, 32 + known, end - start, REST));
   return key;
+}
+
+// Slots of the rows that each part brings, bands aside: those that move, at least one part, and those that stand still.
+function turnsOf({ own, moving, partRows }) {
+  const cut = (start, end) => Array.from({ length: Math.ceil((end - start) / partRows) },
+    (_, k) => [start + k * partRows, Math.min(start + (k + 1) * partRows, end)]);
+  const movers = cut(own.moving, moving);
+  return [...(movers.length ? movers : [[moving, moving]]), ...cut(own.still, own.stillEnd)];
 }
 
 function takeRows(key, from) {
@@ -355,11 +365,9 @@ function takeRows(key, from) {
 }
 
 function fillPart(key, number, bytes) {
-  const { own, partRows } = key, degree = Math.sqrt((scene.columns - COLOURS) / 3) - 1;
-  const band = number - (key.parts - degree) + 1;
-  if (band > 0) return fillBand(key, band, bytes);
-  const start = own.still + (number - 1) * partRows;
-  fill(key, start, readColumns(bytes, 0, Math.min(own.stillEnd - start, partRows), REST));
+  if (number >= key.turns.length) return fillBand(key, number - key.turns.length + 1, bytes);
+  const [start, end] = key.turns[number];
+  fill(key, start, readColumns(bytes, 0, end - start, REST));
 }
 
 function fillBand(key, band, bytes) {
