@@ -414,18 +414,27 @@ function unpackFrame(bytes, key, [before, after]) {
   const slotCount = WIDTH * key.rows, packed = before.packed.slice(0);
   const shorts = new Uint16Array(packed), octets = new Uint8Array(packed);
   const nextShorts = after && new Uint16Array(after.packed), nextOctets = after && new Uint8Array(after.packed);
-  xyz.forEach((values, axis) => {
-    for (let row = 0, at = axis; row < moving; row++, at += 8) {
-      const way = after ? ((((nextShorts[at] - shorts[at]) << 16) >> 16) + 1) >> 1 : 0;
-      shorts[at] += way + values[row];
-    }
-  });
-  attributes.forEach((values, column) => {
-    for (let row = 0, at = place(column, slotCount); row < moving; row++, at += 16) {
-      octets[at] = (after ? (octets[at] + nextOctets[at] + 1) >> 1 : octets[at]) + values[row];
-    }
-  });
+  for (let start = 0; start < moving; start += WIDTH) { // a texture row at a time stays in the processor's cache
+    const end = Math.min(start + WIDTH, moving);
+    xyz.forEach((values, axis) => addPositions(shorts, nextShorts, axis, values, start, end));
+    attributes.forEach((values, column) => {
+      addAttributes(octets, nextOctets, place(column, slotCount), values, start, end);
+    });
+  }
   return { segment, packed, bytes: packed.byteLength };
+}
+
+function addPositions(shorts, next, axis, values, start, end) {
+  for (let row = start, at = 8 * start + axis; row < end; row++, at += 8) {
+    const way = next ? ((((next[at] - shorts[at]) << 16) >> 16) + 1) >> 1 : 0;
+    shorts[at] += way + values[row];
+  }
+}
+
+function addAttributes(octets, next, first, values, start, end) {
+  for (let row = start, at = first + 16 * start; row < end; row++, at += 16) {
+    octets[at] = (next ? (octets[at] + next[at] + 1) >> 1 : octets[at]) + values[row];
+  }
 }
 
 // First byte of a column: a Gaussian has 6 bytes of position and one per column, 16 to a layer.
