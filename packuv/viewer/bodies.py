@@ -26,7 +26,7 @@ SPAN = 8
 """Frames from one that is predicted from the key alone to the next"""
 
 PART_ROWS = 16384
-"""Rows that stand still of a part of a key: some 200 kB, a second and a half at 1 Mbit/s"""
+"""Rows of a part of a key: some 220 kB, two seconds at 1 Mbit/s"""
 
 CACHE_BYTES = 64 << 20
 """Bodies that are kept as they are sent: a scene that is looked at is looked at again"""
@@ -80,6 +80,12 @@ class KeyRows:
         """Rows that the segment brings itself, moving and still."""
         moving, still = ((self.fates == fate).sum() for fate in (KEPT_DYNAMIC, KEPT_STILL))
         return slice(int(moving), self.dynamic), slice(self.dynamic + int(still), len(self.order))
+
+
+def turns(moving: slice, still: slice, size: int) -> list[slice]:
+    """Rows of each part of a key, apart from bands: those that move, at least one part, and those that stand still."""
+    parts = [slice(k, min(k + size, rows.stop)) for rows in (moving, still) for k in range(rows.start, rows.stop, size)]
+    return parts if moving.start < moving.stop else [moving, *parts]
 
 
 def importance(codes: Codes, quantizer: Quantizer) -> np.ndarray:
@@ -167,7 +173,7 @@ class Bodies:
         brought[here] = False
         moving, still = (np.flatnonzero(brought & which) for which in (dynamic, ~dynamic))
         parts = (
-            here[dynamic[here]], _along_curve(key, moving),
+            here[dynamic[here]], self._by_importance(key, moving),
             here[~dynamic[here]], self._by_importance(key, still),
         )  # fmt: skip
         return KeyRows(np.concatenate(parts), int(dynamic.sum()), reference, fates)
@@ -179,28 +185,25 @@ class Bodies:
         return np.concatenate([NO_ROWS, *(_along_curve(key, turn) for turn in turns)])
 
     def _part_count(self, plan: KeyRows) -> int:
-        still, degree = plan.own[1], self.source.quantizer.sh_degree
-        return 1 + degree + len(range(still.start, still.stop, PART_ROWS))
+        degree: int = self.source.quantizer.sh_degree
+        return len(turns(*plan.own, PART_ROWS)) + degree
 
     def _part(self, segment: int, number: int) -> bytes:
         plan = self._plan(segment)
-        count = self._part_count(plan)
+        codes, (moving, still) = self.source.key(segment)[plan.order], plan.own
+        rows, count = turns(moving, still, PART_ROWS), self._part_count(plan)
         if not 0 <= number < count:
             raise IndexError(f"part {number} of a key with {count}")
-        codes = self.source.key(segment)[plan.order]
-        moving, still = plan.own
-        band = number - (count - self.source.quantizer.sh_degree) + 1
-        if band > 0:
-            own = np.concatenate([codes.attributes[rows, columns_of_band(band)] for rows in (moving, still)])
+        if number >= len(rows):
+            band = columns_of_band(number - len(rows) + 1)
+            own = np.concatenate([codes.attributes[which, band] for which in (moving, still)])
             return deflated(column_planes(None, own, colours=0))
+        part = codes[rows[number]]
+        columns = column_planes(part.xyz, part.attributes[:, :REST])
         if number > 0:
-            start = still.start + (number - 1) * PART_ROWS
-            part = codes[start : min(still.stop, start + PART_ROWS)]
-            return deflated(column_planes(part.xyz, part.attributes[:, :REST]))
+            return deflated(columns)
         reference = NO_REFERENCE if plan.reference is None else plan.reference
         head = (len(codes), plan.dynamic, codes.attributes.shape[1], reference, len(plan.fates), PART_ROWS, count, 0)
-        part = codes[moving]
-        columns = column_planes(part.xyz, part.attributes[:, :REST])
         return deflated([np.array(head, "<u4"), plan.fates, *columns])
 
     def _frame(self, frame: int) -> bytes:
@@ -276,9 +279,7 @@ def read_key(parts: Sequence[bytes], reference: ReadKey | None) -> ReadKey:
             codes.attributes[start : start + len(kept)] = reference.codes.attributes[kept]
     moving, still = rows.own
     degree = next(degree for degree in range(number) if attribute_count(degree) == columns)
-    for k, body in enumerate(parts[: number - degree]):
-        start = still.start + (k - 1) * size
-        own = slice(start, min(still.stop, start + size)) if k else moving
+    for k, (body, own) in enumerate(zip(parts, turns(moving, still, size), strict=False)):
         xyz, attributes = read_columns(body, 0 if k else 32 + known, own.stop - own.start, REST)
         codes.xyz[own], codes.attributes[own, :REST] = xyz, attributes
     own_rows = np.r_[moving, still]

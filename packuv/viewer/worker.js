@@ -335,8 +335,18 @@ function beginKey(bytes, segment) {
     reference: reference === NO_REFERENCE ? null : reference, taken: false, arrived: 1, version: 0, base: null,
     bands: 1, own: { moving: taken[1], still: WIDTH * rows + taken[0], stillEnd: WIDTH * rows + count - moving },
   };
-  fill(key, key.own.moving, readColumns(bytes, 32 + known, moving - key.own.moving, REST));
+  key.turns = turnsOf(key);
+  const [start, end] = key.turns[0];
+  fill(key, start, readColumns(bytes, 32 + known, end - start, REST));
   return key;
+}
+
+// Slots of the rows that each part brings, bands aside: those that move, at least one part, and those that stand still.
+function turnsOf({ own, moving, partRows }) {
+  const cut = (start, end) => Array.from({ length: Math.ceil((end - start) / partRows) },
+    (_, k) => [start + k * partRows, Math.min(start + (k + 1) * partRows, end)]);
+  const movers = cut(own.moving, moving);
+  return [...(movers.length ? movers : [[moving, moving]]), ...cut(own.still, own.stillEnd)];
 }
 
 function takeRows(key, from) {
@@ -357,11 +367,9 @@ function takeRows(key, from) {
 }
 
 function fillPart(key, number, bytes) {
-  const { own, partRows } = key, degree = Math.sqrt((scene.columns - COLOURS) / 3) - 1;
-  const band = number - (key.parts - degree) + 1;
-  if (band > 0) return fillBand(key, band, bytes);
-  const start = own.still + (number - 1) * partRows;
-  fill(key, start, readColumns(bytes, 0, Math.min(own.stillEnd - start, partRows), REST));
+  if (number >= key.turns.length) return fillBand(key, number - key.turns.length + 1, bytes);
+  const [start, end] = key.turns[number];
+  fill(key, start, readColumns(bytes, 0, end - start, REST));
 }
 
 function fillBand(key, band, bytes) {
@@ -408,18 +416,27 @@ function unpackFrame(bytes, key, [before, after]) {
   const slotCount = WIDTH * key.rows, packed = before.packed.slice(0);
   const shorts = new Uint16Array(packed), octets = new Uint8Array(packed);
   const nextShorts = after && new Uint16Array(after.packed), nextOctets = after && new Uint8Array(after.packed);
-  xyz.forEach((values, axis) => {
-    for (let row = 0, at = axis; row < moving; row++, at += 8) {
-      const way = after ? ((((nextShorts[at] - shorts[at]) << 16) >> 16) + 1) >> 1 : 0;
-      shorts[at] += way + values[row];
-    }
-  });
-  attributes.forEach((values, column) => {
-    for (let row = 0, at = place(column, slotCount); row < moving; row++, at += 16) {
-      octets[at] = (after ? (octets[at] + nextOctets[at] + 1) >> 1 : octets[at]) + values[row];
-    }
-  });
+  for (let start = 0; start < moving; start += WIDTH) { // a texture row at a time stays in the processor's cache
+    const end = Math.min(start + WIDTH, moving);
+    xyz.forEach((values, axis) => addPositions(shorts, nextShorts, axis, values, start, end));
+    attributes.forEach((values, column) => {
+      addAttributes(octets, nextOctets, place(column, slotCount), values, start, end);
+    });
+  }
   return { segment, packed, bytes: packed.byteLength };
+}
+
+function addPositions(shorts, next, axis, values, start, end) {
+  for (let row = start, at = 8 * start + axis; row < end; row++, at += 8) {
+    const way = next ? ((((next[at] - shorts[at]) << 16) >> 16) + 1) >> 1 : 0;
+    shorts[at] += way + values[row];
+  }
+}
+
+function addAttributes(octets, next, first, values, start, end) {
+  for (let row = start, at = first + 16 * start; row < end; row++, at += 16) {
+    octets[at] = (next ? (octets[at] + next[at] + 1) >> 1 : octets[at]) + values[row];
+  }
 }
 
 // First byte of a column: a Gaussian has 6 bytes of position and one per column, 16 to a layer.

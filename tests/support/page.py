@@ -41,8 +41,10 @@ class Page:
                 xyz[start : start + size] = before.xyz[fates == fate]
                 attributes[start : start + size] = before.attributes[fates == fate]
         degree = int(((columns - 7) / 3) ** 0.5) - 1
-        starts = [(moving_taken, dynamic)]
-        starts += [(s, min(s + part_rows, count)) for s in range(dynamic + still_taken, count, part_rows)]
+        ranges = (moving_taken, dynamic), (dynamic + still_taken, count)
+        starts = [(s, min(s + part_rows, end)) for start, end in ranges for s in range(start, end, part_rows)]
+        if moving_taken == dynamic:
+            starts.insert(0, (dynamic, dynamic))
         assert parts == len(starts) + degree
         for number, (start, end) in enumerate(starts):
             body = self._get(f"segments/{segment}/{number}.bin")[0 if number else 32 + known :]

@@ -11,6 +11,7 @@ import json
 import re
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
@@ -30,7 +31,7 @@ from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.scene.mosaic import NEUTRAL
 from packuv.viewer.bodies import Bodies
 from packuv.viewer.folder import WebOptions, checksum, read_deltas, read_index, read_video, write_web
-from packuv.viewer.source import SceneSource
+from packuv.viewer.source import SceneSource, open_source
 from packuv.viewer.streams import (
     MOST_PIXELS,
     Sheet,
@@ -43,6 +44,7 @@ from packuv.viewer.streams import (
     read_stream,
 )
 from tests.support.browser import Browser, running_browser
+from tests.support.viewed import running
 
 
 def quantizer(degree):
@@ -387,3 +389,19 @@ def test_damaged_bytes_of_a_folder_cost_their_frame(browser, sites, tmp_path, ra
         browser.open(address + "#play=0&frame=3", 160, 120)
         browser.wait_for("document.documentElement.dataset.lost == 1 && document.documentElement.dataset.frame == 3")
         assert browser.evaluate("document.getElementById('wait').hidden")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["colour", "depth", "dynamic", "opacity", "map", "layer"])
+def test_a_folder_shows_what_the_viewer_shows_in_every_mode(browser, scene_path, sites, mode):
+    wish, pictures = f"#bare=1&play=0&frame=1&camera=cam1&mode={mode}", []
+    with open_source(scene_path) as source, running(source) as server, served(sites[WebCodec.VP9], ranges=True) as site:
+        for address in (server.url, site[0]):
+            browser.open(address + wish, 160, 120)
+            browser.wait_for("document.documentElement.dataset.frame == 1")
+            if mode == "layer":
+                browser.wait_for("document.documentElement.dataset.layers == 0")
+            time.sleep(0.5)  # drawn
+            pictures.append(browser.picture())
+    assert np.array_equal(*pictures)
+    assert pictures[0].std() > 5
