@@ -521,8 +521,8 @@ def _import(command: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="IN",
-        help="PLY, compressed PLY, SPZ or SOG: one for a still scene, several or a folder for a sequence; "
-        "or an atlas video",
+        help="PLY, compressed PLY, SPZ, SOG, .splat or .ksplat: one for a still scene, several or a folder for a "
+        "sequence; or an atlas video",
     )
     command.add_argument("--fps", type=_rate, default="30", help="frames per second of a sequence, may be a fraction")
     command.add_argument("--sh-degree", type=int, default=None, metavar="N", help="highest SH degree to keep (all)")

@@ -12,6 +12,7 @@ import numpy as np
 from packuv.colour import OFFSET, light_factors, linear_from_srgb, srgb_from_linear
 from packuv.gaussians.floats import SH_C0, Gaussians, drawn, lit_gaussians, opacity, rows_of
 from packuv.interchange.conventions import is_drawn
+from packuv.progress import Progress, no_progress
 from packuv.scene import Scene
 
 ANTIALIASED = "antialiased"
@@ -68,8 +69,8 @@ def baking_error(gaussians: Gaussians, light: np.ndarray) -> Baking:
 class Clip:
     """Frames of a scene, read in order; memory does not grow with their number."""
 
-    def __init__(self, scene: Scene, frames: range, options: ClipOptions) -> None:
-        self._scene, self.frames, self.options = scene, frames, options
+    def __init__(self, scene: Scene, frames: range, options: ClipOptions, *, progress: Progress = no_progress) -> None:
+        self._scene, self.frames, self.options, self._progress = scene, frames, options, progress
         self.baking = Baking()
         """The worst of the frames read so far"""
         self.drawn = 0
@@ -79,7 +80,9 @@ class Clip:
         return len(self.frames)
 
     def __iter__(self) -> Iterator[Gaussians]:
-        return map(self.frame, self.frames)
+        for done, number in enumerate(self.frames, start=1):
+            yield self.frame(number)
+            self._progress(done, len(self))
 
     @property
     def rate(self) -> Fraction:

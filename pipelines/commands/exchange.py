@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from packuv.gaussians.uvsize import UvOptions
     from packuv.interchange import SplatFormat
     from packuv.interchange.clip import Clip
-    from packuv.progress import Progress
     from packuv.scene import Scene
 
 
@@ -43,16 +42,16 @@ def export_frames(arguments: argparse.Namespace) -> int:
             frames = range(arguments.frame, arguments.frame + 1)
         else:
             frames = frames_of(len(scene), arguments.frames)
-        clip = Clip(scene, frames, options)
         with shown(arguments, "export") as progress:
-            count, what = _write_clip(clip, arguments, kind, progress)
+            clip = Clip(scene, frames, options, progress=progress)
+            count, what = _write_clip(clip, arguments, kind)
         print(f"{arguments.output}: {what}")
         for line in _told(clip, kind, count, scene.header.light[frames.start : frames.stop]):
             print(line)
     return 0
 
 
-def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat, progress: Progress) -> tuple[int, str]:
+def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat) -> tuple[int, str]:
     """How many drawn Gaussians went out, and what was written."""
     from packuv.files import whole_folder
     from packuv.interchange import write_gaussians
@@ -68,9 +67,8 @@ def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat, pr
         return count, f"{count:,} Gaussians of {span}"
     count = 0
     with whole_folder(output) as folder:
-        for done, frame in enumerate(frames, start=1):
-            count += write(folder / f"{frame:06d}{kind.suffix}", clip.frame(frame))
-            progress(done, len(frames))
+        for frame, gaussians in zip(frames, clip, strict=True):
+            count += write(folder / f"{frame:06d}{kind.suffix}", gaussians)
     return count, f"{len(frames)} files, {span}"
 
 
@@ -80,7 +78,7 @@ def _told(clip: Clip, kind: SplatFormat, count: int, light: np.ndarray) -> Itera
 
     yield f"format     {kind.door.lacks}"
     if left := clip.drawn - count:  # by SPZ's fixed point
-        yield f"left out   {left:,} Gaussians, so far away that positions of the others would be coarse"
+        yield f"left out   {left:,} of {clip.drawn:,} Gaussians, so far away that others would have coarse positions"
     if clip.options.keep_rows:
         starts = [clip.frames[k] for k, (a, b) in enumerate(pairwise([-1, *clip.segments])) if a != b]
         yield f"rows       are the same Gaussians until they begin anew at frames {', '.join(map(str, starts))}"
