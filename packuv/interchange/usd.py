@@ -2,7 +2,8 @@
 
 Attributes are float32: positions, unit quaternions, standard deviations, alpha, and SH coefficients as 3D Gaussian
 Splatting has them, all of a Gaussian after one another. The stage has y up: frames take half a turn about x, in the
-numbers. Samples of different lengths are held; those of kept rows have one length within a segment.
+numbers. Samples of different lengths are held; those of kept rows have one length within a segment. One frame alone is
+written without samples.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ def write_usd(path: Path, clip: Clip) -> int:
         codes = np.round(clip.seconds * rate, 6).tolist()
         stage.SetStartTimeCode(codes[0])
         stage.SetEndTimeCode(codes[-1])
+        if len(clip) == 1:  # a still has values, which programs read that know no samples
+            codes = [pxr.Usd.TimeCode.Default()]
         for code, gaussians in zip(codes, clip, strict=True):
             mask = is_drawn(gaussians)
             _set(pxr, prim, half_turn(rows_out(gaussians, mask, keep_rows=clip.options.keep_rows)), code)
@@ -63,8 +66,8 @@ def _pxr() -> Any:
     return pxr
 
 
-def _set(pxr: Any, prim: Any, kept: Gaussians, code: float) -> None:
-    """One time sample of every attribute."""
+def _set(pxr: Any, prim: Any, kept: Gaussians, code: Any) -> None:
+    """One time sample of every attribute, or its value."""
     vectors, vt = pxr.Vt.Vec3fArray, pxr.Vt
     samples = (
         (prim.CreatePositionsAttr(), vectors, kept.means),

@@ -275,6 +275,23 @@ def test_usd_holds_every_frame_at_its_time(scene, tmp_path, keep_rows):
             assert np.allclose(wxyz, truth.quaternions[7] / np.linalg.norm(truth.quaternions[7]), atol=1e-6)
 
 
+@needs_usd
+@needs_fourdgs
+def test_a_still_in_usd_is_read_by_another_program(scene, tmp_path):
+    import fourdgs
+
+    with open_scene(scene) as opened:
+        SplatFormat.USD.door.write_clip(tmp_path / "a.usda", Clip(opened, range(2, 3), ClipOptions()))
+        truth = half_turn(drawn(opened.gaussians(2)))
+    read = fourdgs.from_usd(str(tmp_path / "a.usda"))
+    assert read.metadata["coordinate_system"] == "y-up-right-handed"
+    assert np.allclose(read.gaussians.positions, truth.means, rtol=1e-6)
+    assert np.allclose(read.gaussians.scales, np.exp(truth.log_scales), rtol=1e-5)
+    assert np.allclose(read.gaussians.colors[:, 3], opacity(truth), atol=1e-6)
+    turns = truth.quaternions / np.linalg.norm(truth.quaternions, axis=1, keepdims=True)
+    assert np.allclose(read.gaussians.rotations, turns[:, [1, 2, 3, 0]], atol=1e-6)
+
+
 def fourdgs_sources(content):
     """Segment and row of all Gaussians, int [n, 2], from the streams that the library writes and does not show."""
     from fourdgs import opcode, records, serialization, stream_reader
