@@ -95,6 +95,12 @@ class Clip:
         return np.asarray((times - times[:1]) / 1e9, np.float64)
 
     @property
+    def gains(self) -> np.ndarray:
+        """Light of each frame, float64 [T, 3]: factors on linear light, r g b; 1 is steady."""
+        gains: np.ndarray = np.exp(self._scene.header.light[self.frames.start : self.frames.stop])
+        return gains
+
+    @property
     def segments(self) -> list[int]:
         """Number of the segment of each frame; rows are numbered anew in each."""
         return [self._scene.segment_at(frame) for frame in self.frames]

@@ -14,8 +14,6 @@ from pipelines.commands.terminal import print_facts, shown
 from pipelines.disk import size_text
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from calibration.rig import Rig
     from packuv.gaussians.uvsize import UvOptions
     from packuv.interchange import SplatFormat
@@ -46,19 +44,21 @@ def export_frames(arguments: argparse.Namespace) -> int:
             clip = Clip(scene, frames, options, progress=progress)
             count, what = _write_clip(clip, arguments, kind)
         print(f"{arguments.output}: {what}")
-        for line in _told(clip, kind, count, scene.header.light[frames.start : frames.stop]):
+        for line in _told(clip, kind, count):
             print(line)
     return 0
 
 
 def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat) -> tuple[int, str]:
     """How many drawn Gaussians went out, and what was written."""
-    from packuv.files import whole_folder
+    from packuv.files import save_json, whole_folder
     from packuv.interchange import write_gaussians
 
     frames, output = clip.frames, arguments.output
     span = f"frame {frames[0]}" if len(frames) == 1 else f"frames {frames.start} to {frames.stop - 1}"
     if kind.door.write_clip is not None:
+        if output.suffix.lower() not in kind.door.suffixes:
+            raise ValueError(f"{kind} is one file, named {' or '.join(kind.door.suffixes)}, but not {output.name}")
         count = kind.door.write_clip(output, clip)
         return count, f"{count:,} Gaussians of {span}"
     write = partial(write_gaussians, kind=kind, antialiased=clip.antialiased, keep_rows=clip.options.keep_rows)
@@ -69,20 +69,20 @@ def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat) ->
     with whole_folder(output) as folder:
         for frame, gaussians in zip(frames, clip, strict=True):
             count += write(folder / f"{frame:06d}{kind.suffix}", gaussians)
+        if not clip.options.bake_light:
+            save_json(folder / "light.json", {"frames": list(frames), "gains": clip.gains.tolist()})
     return count, f"{len(frames)} files, {span}"
 
 
-def _told(clip: Clip, kind: SplatFormat, count: int, light: np.ndarray) -> Iterator[str]:
+def _told(clip: Clip, kind: SplatFormat, count: int) -> Iterator[str]:
     """What went otherwise than in the scene: what the format loses, is left out, or was made of light and rows."""
-    import numpy as np
-
     yield f"format     {kind.door.lacks}"
     if left := clip.drawn - count:  # by SPZ's fixed point
         yield f"left out   {left:,} of {clip.drawn:,} Gaussians, so far away that others would have coarse positions"
     if clip.options.keep_rows:
         starts = [clip.frames[k] for k, (a, b) in enumerate(pairwise([-1, *clip.segments])) if a != b]
         yield f"rows       are the same Gaussians until they begin anew at frames {', '.join(map(str, starts))}"
-    if not light.any():
+    if (clip.gains == 1).all():
         return
     if clip.options.bake_light:
         rms, largest = (255 * value for value in (clip.baking.rms, clip.baking.largest))
@@ -91,7 +91,7 @@ def _told(clip: Clip, kind: SplatFormat, count: int, light: np.ndarray) -> Itera
             "gains are of linear light, SH of sRGB"
         )
     else:
-        low, high = np.exp(light.min()), np.exp(light.max())
+        low, high = clip.gains.min(), clip.gains.max()
         yield f"light      is left out: of {low:.1%} to {high:.1%} of steady light, in which frames are written"
 
 

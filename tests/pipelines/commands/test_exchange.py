@@ -140,6 +140,11 @@ def test_parts_rows_and_light_are_chosen(scene, lit_scene, tmp_path, capsys):
             assert np.array_equal(back.means, truth.means[:30])
             assert np.array_equal(back.sh, truth.sh[:30])
     assert (back.opacity_logits < -10).sum() == 4
+    gains = json.loads((tmp_path / "a" / "light.json").read_text())
+    assert gains["frames"] == [0, 1, 2]
+    assert np.allclose(gains["gains"], np.exp(LIGHT), atol=1e-4)
+    assert run("import", tmp_path / "a", "--keep-all", "-o", tmp_path / "a.mkv") == OK
+    capsys.readouterr()
     assert run(*words, "-o", tmp_path / "b") == OK
     told = capsys.readouterr().out
     assert re.search(
@@ -149,6 +154,12 @@ def test_parts_rows_and_light_are_chosen(scene, lit_scene, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "light  " not in told
     assert "left out" not in told
+
+
+def test_a_sequence_in_one_file_has_the_name_of_its_format(scene, tmp_path, capsys):
+    assert run("export", scene, "--frames", ":", "--format", "usd", "-o", tmp_path / "frames") == WRONG
+    assert "usd is one file, named .usdc or .usda or .usd, but not frames" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_pictures_are_drawn_in_the_light_of_their_frame(scene, lit_scene, tmp_path):
