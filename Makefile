@@ -8,12 +8,17 @@ PYTEST ?=
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: demo test test-fast check gpu setup clean
+.PHONY: demo pictures test test-fast check gpu setup clean
 
 demo: $(READY)
 	$(BIN)/packuv simulate runs/demo/capture --cameras 8 --frames 24 --size 320x180 --seed 7 --rig front
 	$(BIN)/packuv run runs/demo/capture --out runs/demo --preset draft \
 		--set fit.iterations=1800 --set fit.key_iterations=800 --set fit.density.cap=30000
+
+# The pictures of README and docs, and the scene in examples/, of the demo; Chromium must be on the PATH.
+pictures: $(READY)
+	test -f runs/demo/studio/report.html || $(MAKE) demo
+	$(BIN)/python -m tests.support.gallery runs/demo/studio
 
 test: $(READY)
 	$(BIN)/python -m pytest $(PYTEST)

@@ -10,12 +10,12 @@ import tempfile
 from pathlib import Path
 
 import packuv
-from packuv.interchange import SplatFormat, write_gaussians
+from packuv.interchange import SplatFormat, format_of, write_gaussians
 from packuv.interchange.adopt import AdoptOptions, adopt, find_frames
 
 
 def main(source: Path, out: Path) -> None:
-    kind = next(kind for kind in reversed(SplatFormat) if out.name.endswith(kind.suffix))
+    kind = format_of(out) or SplatFormat.PLY
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.mkv"
         report = adopt(find_frames([source]), path, options=AdoptOptions(uv=None))  # no UV map: keep all that is drawn

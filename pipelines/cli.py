@@ -41,6 +41,9 @@ SINGLE = {
 }
 """Commands that run the stages up to the one they name"""
 
+SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "spz3", "sog", "splat", "gltf", "usd", "4dgs")
+"""What `packuv.interchange` writes, which is too heavy to be asked before a command is chosen"""
+
 WRONG_PATH = frozenset({errno.ENAMETOOLONG, errno.ELOOP})
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
@@ -466,11 +469,31 @@ def _export_frames(command: argparse.ArgumentParser) -> None:
     _scene(command)
     which = command.add_mutually_exclusive_group(required=True)
     which.add_argument("--frame", type=int, metavar="N", help="one frame, counted from 0, to a file")
-    which.add_argument("--frames", type=_range, metavar="A:B", help="frames A to B - 1, to a folder of files")
+    which.add_argument(
+        "--frames", type=_range, metavar="A:B", help="frames A to B - 1, to a folder of files; of usd and 4dgs, a file"
+    )
     command.add_argument(
         "--format",
-        choices=("ply", "compressed-ply", "spz"),
-        help="standard 3DGS PLY, SuperSplat's compressed PLY, or SPZ (from the name of the output, or ply)",
+        choices=SPLAT_FORMATS,
+        help="standard 3DGS PLY, SuperSplat's compressed PLY, SPZ of version 4 or 3, SOG, .splat, glTF with "
+        "KHR_gaussian_splatting, OpenUSD, .4dgs (from the name of the output, or ply)",
+    )
+    command.add_argument(
+        "--part",
+        choices=("backdrop", "people", "both"),
+        default="both",
+        help="what stands still for the whole of its segment, what may move in it, or both",
+    )
+    command.add_argument(
+        "--light",
+        choices=("baked", "left"),
+        default="baked",
+        help="each frame as seen in its own light, which then is in its colours, or in steady light",
+    )
+    command.add_argument(
+        "--keep-rows",
+        action="store_true",
+        help="row N is the same Gaussian in all frames of a segment, where it is absent with alpha 0",
     )
     _output(command, "OUT", "file, or folder for 000000.ply, ...")
 
@@ -504,8 +527,8 @@ def _import(command: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="IN",
-        help="PLY, compressed PLY, SPZ or SOG: one for a still scene, several or a folder for a sequence; "
-        "or an atlas video",
+        help="PLY, compressed PLY, SPZ, SOG, .splat or .ksplat: one for a still scene, several or a folder for a "
+        "sequence; or an atlas video",
     )
     command.add_argument("--fps", type=_rate, default="30", help="frames per second of a sequence, may be a fraction")
     command.add_argument("--sh-degree", type=int, default=None, metavar="N", help="highest SH degree to keep (all)")

@@ -24,6 +24,7 @@ from packuv.gaussians.segment import Segment
 from packuv.gaussians.uvmap import assign_slots, choose_centre
 from packuv.gaussians.uvsize import UvOptions
 from packuv.interchange import antialiased, is_splats, read_gaussians
+from packuv.interchange.clip import ANTIALIASED
 from packuv.interchange.joined import equal_codes, segments_of
 from packuv.interchange.orbit import OrbitOptions, around, likeness, middle, near_of, orbit
 from packuv.progress import Progress, no_progress, part_of
@@ -40,8 +41,6 @@ SEEN_LOG_SCALE = 1.0
 """The same of a log scale"""
 MOST_VALUE = MOST_NUMBER / 10
 """Of a sound Gaussian: the ranges of codes, which reach a little farther, end at MOST_NUMBER"""
-ANTIALIASED = "antialiased"
-"""Field of a header's `extra`: trained with the opacities of Mip-Splatting"""
 ROTATION_REACH = 0.7072
 """x, y and z of a canonical rotation are at most the square root of one half."""
 

@@ -12,8 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from packuv.gaussians.floats import SH_C0, Gaussians, drawn, rows_of
-from packuv.interchange.conventions import alpha_codes, drop_largest, logits_of_alpha, restore_largest
+from packuv.gaussians.floats import SH_C0, Gaussians, rows_of
+from packuv.interchange.conventions import (
+    alpha_codes,
+    drop_largest,
+    is_drawn,
+    logits_of_alpha,
+    restore_largest,
+    rows_out,
+)
 from packuv.interchange.ply import columns_of, write_tables
 
 CHUNK = 256
@@ -26,9 +33,14 @@ _BITS = (11, 10, 11)
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
-def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
-    """Write a compressed PLY, in Morton order, and return the number of Gaussians; what is not drawn is left out."""
-    kept = _in_morton_order(drawn(gaussians))
+def write_compressed_ply(path: Path, gaussians: Gaussians, *, keep_rows: bool = False) -> int:
+    """Write a compressed PLY and return the number of drawn Gaussians in it.
+
+    What is not drawn is left out, and rows come in Morton order, so that chunks are small; or rows stay as they are.
+    """
+    mask = is_drawn(gaussians)
+    kept = rows_out(gaussians, mask, keep_rows=keep_rows)
+    kept = kept if keep_rows else _in_morton_order(kept)
     colour = 0.5 + SH_C0 * kept.sh[:, 0].astype(np.float64)
     scale = np.clip(kept.log_scales.astype(np.float64), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
     groups = [(_POSITION, kept.means.astype(np.float64)), (_SCALE, scale), (_COLOUR, colour)]
@@ -42,7 +54,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
     if kept.sh_degree:
         tables["sh"] = _pack_bands(kept.sh[:, 1:])
     write_tables(path, tables)
-    return len(vertex)
+    return int(mask.sum())
 
 
 def unpack(path: Path, tables: dict[str, np.ndarray]) -> Gaussians:

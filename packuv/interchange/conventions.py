@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from packuv.gaussians.floats import Gaussians
+from packuv.gaussians.floats import DRAWN_LOGIT, Gaussians, rows_of
 
 OPAQUE_LOGIT = 20.0
 """For an alpha of 1, which has no finite logit: float32 rounds its alpha to 1"""
+ABSENT_LOGIT = -20.0
+"""For an alpha of 0, of a row that is kept for its number: float32 has 2e-9, 8 bits have 0"""
 FLATNESS = np.log(100.0)
 """An axis of no thickness is so much thinner, natural logarithm, than the thinnest of its Gaussian that has some"""
 LEAST_LOG_SCALE = -20.0
@@ -30,6 +32,48 @@ def finite(gaussians: Gaussians) -> Gaussians:
     if opaque.any():
         logits = np.where(opaque, OPAQUE_LOGIT, logits).astype(np.float32)
     return replace(gaussians, log_scales=scales, opacity_logits=logits)
+
+
+def is_drawn(gaussians: Gaussians) -> np.ndarray:
+    """Mask [n] of those that a renderer would draw."""
+    drawn: np.ndarray = gaussians.opacity_logits >= DRAWN_LOGIT
+    return drawn
+
+
+def rows_out(gaussians: Gaussians, mask: np.ndarray, *, keep_rows: bool) -> Gaussians:
+    """The Gaussians of a mask; or all in their rows, where the others have alpha 0 and lie as far out as those at most.
+
+    So the same row is the same Gaussian in all frames of a segment.
+    """
+    if not keep_rows:
+        return rows_of(gaussians, mask)
+    reach = np.abs(gaussians.means[mask]).max(initial=0)
+    means = np.where(mask[:, None], gaussians.means, np.clip(gaussians.means, -reach, reach))
+    logits = np.where(mask, gaussians.opacity_logits, np.float32(ABSENT_LOGIT))
+    return replace(gaussians, means=means, opacity_logits=logits)
+
+
+_FLIP_POINT = np.array([1, -1, -1], np.float32)
+_FLIP_ROTATION = np.array([1, 1, -1, -1], np.float32)  # of w x y z: y and z flipped is a half turn about x
+_FLIP_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+"""Sign of each coefficient under y -> -y, z -> -z: -1 for those of odd degree in y z together."""
+
+
+def half_turn(gaussians: Gaussians) -> Gaussians:
+    """The same scene with y up and z back where it had y down and z forward, or the other way round; exactly."""
+    return replace(
+        gaussians,
+        means=gaussians.means * _FLIP_POINT,
+        quaternions=gaussians.quaternions * _FLIP_ROTATION,
+        sh=gaussians.sh * _FLIP_SH[: gaussians.sh.shape[1], None],
+    )
+
+
+def unit(quaternions: np.ndarray) -> np.ndarray:
+    """Quaternions of length 1, float64 [n, 4]; those of no length are the identity, w x y z."""
+    q = quaternions.astype(np.float64)
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(length > 0, q / np.maximum(length, 1e-12), [1.0, 0, 0, 0])
 
 
 def alpha_codes(logits: np.ndarray) -> np.ndarray:

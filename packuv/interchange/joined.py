@@ -77,11 +77,16 @@ def equal_codes(codes: Codes, others: Codes) -> np.ndarray:
 
     No row of `others` serves twice: among equals the first goes with the first.
     """
-    both = np.concatenate([_as_bytes(codes), _as_bytes(others)])
+    return equal_rows(_as_bytes(codes), _as_bytes(others))
+
+
+def equal_rows(values: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The same of rows of any kind, each as one value of bytes, [n]."""
+    both = np.concatenate([values, others])
     _, group = np.unique(both, return_inverse=True)
-    ours, theirs = (_numbered(part, len(both)) for part in (group[: len(codes)], group[len(codes) :]))
+    ours, theirs = (_numbered(part, len(both)) for part in (group[: len(values)], group[len(values) :]))
     _, row, other = np.intersect1d(ours, theirs, assume_unique=True, return_indices=True)
-    found = np.full(len(codes), -1, np.int64)
+    found = np.full(len(values), -1, np.int64)
     found[row] = other
     return found
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from packuv.bounds import MOST_GAUSSIANS, shown
 from packuv.files import whole_file
-from packuv.gaussians.floats import Gaussians, drawn
+from packuv.gaussians.floats import Gaussians
+from packuv.interchange.conventions import is_drawn, rows_out
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -30,13 +31,15 @@ _ELEMENTS = ("vertex", "chunk", "sh")
 _NAMES = {"f4": "float", "u4": "uint", "u1": "uchar"}
 
 
-def write_ply(path: Path, gaussians: Gaussians) -> int:
-    """Write a standard 3DGS PLY (binary, little-endian) and return the number of Gaussians in it.
+def write_ply(path: Path, gaussians: Gaussians, *, keep_rows: bool = False) -> int:
+    """Write a standard 3DGS PLY (binary, little-endian) and return the number of drawn Gaussians in it.
 
-    Absent Gaussians, and others too faint for any renderer (alpha below 1/255), are left out. f_rest runs channel by
+    Absent Gaussians, and others too faint for any renderer (alpha below 1/255), are left out, or have alpha 0 where
+    rows are kept. f_rest runs channel by
     channel: all red coefficients, then green, then blue; rot is w x y z; normals are 0, as 3DGS writes them.
     """
-    kept = drawn(gaussians)
+    mask = is_drawn(gaussians)
+    kept = rows_out(gaussians, mask, keep_rows=keep_rows)
     sh = kept.sh  # [n, coefficients, 3]
     rest = [sh[:, k, channel] for channel in range(3) for k in range(1, sh.shape[1])]
     columns = [
@@ -52,7 +55,7 @@ def write_ply(path: Path, gaussians: Gaussians) -> int:
     for name, column in columns:
         table[name] = column
     write_tables(path, {"vertex": table})
-    return len(table)
+    return int(mask.sum())
 
 
 def gaussians_of(path: Path, table: np.ndarray) -> Gaussians:

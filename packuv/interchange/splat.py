@@ -1,4 +1,4 @@
-"""The files of web viewers: `.splat` of 32 bytes a Gaussian, and `.ksplat` of GaussianSplats3D. Read only.
+"""The files of web viewers: `.splat` of 32 bytes a Gaussian, and `.ksplat` of GaussianSplats3D, which is only read.
 
 Both hold standard deviations themselves, colours and alpha as bytes, and quaternions w x y z.
 """
@@ -13,10 +13,28 @@ from pathlib import Path
 import numpy as np
 
 from packuv.bounds import MOST_SH_DEGREE, check_count
+from packuv.files import whole_file
 from packuv.gaussians.floats import SH_C0, Gaussians, arrays
-from packuv.interchange.conventions import logits_of_alpha
+from packuv.interchange.conventions import alpha_codes, is_drawn, logits_of_alpha, rows_out, unit
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
+
+
+def write_splat(path: Path, gaussians: Gaussians, *, keep_rows: bool = False) -> int:
+    """Write a `.splat` file and return the number of drawn Gaussians in it; SH above band 0 does not go along.
+
+    What is not drawn is left out, or has alpha 0 where rows are kept.
+    """
+    mask = is_drawn(gaussians)
+    kept = rows_out(gaussians, mask, keep_rows=keep_rows)
+    rows = np.empty(len(kept), _ROW)
+    rows["means"], rows["scales"] = kept.means, np.exp(kept.log_scales)
+    rows["colour"][:, :3] = np.rint(255 * np.clip(0.5 + SH_C0 * kept.sh[:, 0].astype(np.float64), 0, 1))
+    rows["colour"][:, 3] = alpha_codes(kept.opacity_logits)
+    rows["rotation"] = np.clip(np.rint(unit(kept.quaternions) * 128 + 128), 0, 255)
+    with whole_file(path) as partial:
+        partial.write_bytes(rows.tobytes())
+    return int(mask.sum())
 
 
 def read_splat(path: Path) -> Gaussians:

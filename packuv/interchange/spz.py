@@ -2,8 +2,8 @@
 
 Versions 1 to 3 are one gzip stream behind a header of 16 bytes; version 4 has a plain header of 32 bytes and one zstd
 stream an attribute. Inside, x points right, y up and z back (RUB); splat files and ours have y down and z forward
-(RDF), so that y and z change sign on the way, and with them parts of the rotations and SH bands. Written is version 3,
-which all readers of the format know.
+(RDF), so that y and z change sign on the way, and with them parts of the rotations and SH bands. Written are version 4
+and version 3, which older readers know; their streams are the same.
 """
 
 from __future__ import annotations
@@ -21,8 +21,16 @@ import pyarrow as pa
 
 from packuv.bounds import check_count, check_unpacked
 from packuv.files import whole_file
-from packuv.gaussians.floats import Gaussians, drawn, rows_of
-from packuv.interchange.conventions import alpha_codes, drop_largest, logits_of_alpha, restore_largest
+from packuv.gaussians.floats import Gaussians, rows_of
+from packuv.interchange.conventions import (
+    alpha_codes,
+    drop_largest,
+    half_turn,
+    is_drawn,
+    logits_of_alpha,
+    restore_largest,
+    rows_out,
+)
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
@@ -46,38 +54,58 @@ COARSE = 0.25
 SH_STEPS = (8, 16)
 """Step of the SH codes written in band 1, and in the bands above, as the format's own library has it."""
 
-_FLIP_POINT = np.array([1, -1, -1])
-_FLIP_ROTATION = np.array([1, 1, -1, -1])  # of w x y z: y and z flipped is a half turn about x
-_FLIP_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
-"""Sign of each coefficient above band 0 under y -> -y, z -> -z: those of odd degree in y z together."""
 
+def write_spz(
+    path: Path, gaussians: Gaussians, *, antialiased: bool = False, keep_rows: bool = False, version: int = 4
+) -> int:
+    """Write an SPZ file of version 3 or 4 and return the number of drawn Gaussians in it.
 
-def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
-    """Write an SPZ file of version 3 and return the number of Gaussians in it.
-
-    What is not drawn is left out. Positions get as many fractional bits as the scene's extent allows; the few farthest
-    are left out where others would be coarse for them. Raises ValueError where even whole units do not reach.
+    What is not drawn is left out, or has alpha 0 where rows are kept. Positions get as many fractional bits as the
+    scene's extent allows; the few farthest go as what is not drawn where others would be coarse for them. Raises
+    ValueError where even whole units do not reach.
     """
-    kept = drawn(gaussians)
-    kept = rows_of(kept, _near_enough(kept))
+    mask = is_drawn(gaussians)
+    mask[mask] = _near_enough(rows_of(gaussians, mask))
+    kept = half_turn(rows_out(gaussians, mask, keep_rows=keep_rows))
     bits = _fractional_bits(kept.means)
-    points = np.rint(kept.means.astype(np.float64) * _FLIP_POINT * 2**bits).astype("<i4")
-    rotation = (kept.quaternions * _FLIP_ROTATION)[:, [1, 2, 3, 0]]  # x y z w
-    colours = kept.sh[:, 0].astype(np.float64) * (COLOUR_SCALE * 255) + 127.5
-    streams = [
+    streams = [np.ascontiguousarray(stream).tobytes() for stream in _streams(kept, bits)]
+    flags = ANTIALIASED if antialiased else 0
+    body = (_version_3 if version == 3 else _version_4)(streams, len(kept), kept.sh_degree, bits, flags)
+    with whole_file(path) as partial:
+        partial.write_bytes(body)
+    return int(mask.sum())
+
+
+def write_spz_3(path: Path, gaussians: Gaussians, *, antialiased: bool = False, keep_rows: bool = False) -> int:
+    """The same as version 3."""
+    return write_spz(path, gaussians, antialiased=antialiased, keep_rows=keep_rows, version=3)
+
+
+def _streams(kept: Gaussians, bits: int) -> list[np.ndarray]:
+    """Positions, alphas, colours, scales, rotations and SH bands of Gaussians in the file's axes."""
+    points = np.rint(kept.means.astype(np.float64) * 2**bits).astype("<i4")
+    return [
         points.reshape(-1, 1).view("u1")[:, :3],
         alpha_codes(kept.opacity_logits),
-        _byte(colours),
+        _byte(kept.sh[:, 0].astype(np.float64) * (COLOUR_SCALE * 255) + 127.5),
         _byte((kept.log_scales.astype(np.float64) + 10) * 16),
-        _pack_rotation(rotation),
+        _pack_rotation(kept.quaternions[:, [1, 2, 3, 0]]),
         _pack_bands(kept.sh[:, 1:]),
     ]
-    flags = ANTIALIASED if antialiased else 0
-    header = HEADER.pack(MAGIC, 3, len(kept), kept.sh_degree, bits, flags, 0)
-    body = header + b"".join(np.ascontiguousarray(stream).tobytes() for stream in streams)
-    with whole_file(path) as partial:
-        partial.write_bytes(gzip.compress(body, 6, mtime=0))  # no date: same scene, same bytes
-    return len(kept)
+
+
+def _version_3(streams: list[bytes], *said: int) -> bytes:
+    """Header and streams in one gzip stream, without a date: same scene, same bytes."""
+    return gzip.compress(HEADER.pack(MAGIC, 3, *said, 0) + b"".join(streams), 6, mtime=0)
+
+
+def _version_4(streams: list[bytes], *said: int) -> bytes:
+    """A plain header, a table of packed and plain sizes, and one zstd stream an attribute; empty ones are left out."""
+    plain = [stream for stream in streams if stream]
+    packed = [pa.compress(stream, "zstd", asbytes=True) for stream in plain]
+    header = HEADER.pack(MAGIC, 4, *said, len(plain)) + struct.pack("<I", V4_HEADER_BYTES)
+    table = b"".join(V4_ENTRY.pack(len(small), len(stream)) for small, stream in zip(packed, plain, strict=True))
+    return header.ljust(V4_HEADER_BYTES, b"\0") + table + b"".join(packed)
 
 
 def read_spz(path: Path) -> Gaussians:
@@ -188,14 +216,15 @@ def _gaussians(header: _Header, streams: list[np.ndarray]) -> Gaussians:
     n = header.count
     dc = (colours.reshape(n, 1, 3) / 255 - 0.5) / COLOUR_SCALE
     higher = (bands.reshape(n, (header.degree + 1) ** 2 - 1, 3) - 128.0) / 128
-    sh = np.concatenate([dc, higher * _FLIP_SH[: higher.shape[1], None]], axis=1)
-    return Gaussians(
-        (_points(points, header) * _FLIP_POINT).astype(np.float32),
-        (scales.reshape(n, 3) / 16 - 10).astype(np.float32),
-        _unpack_rotation(rotations.reshape(n, 3 if header.version < 3 else 4))[:, [3, 0, 1, 2]]
-        * _FLIP_ROTATION.astype(np.float32),
-        logits_of_alpha(alphas),
-        sh.astype(np.float32),
+    sh = np.concatenate([dc, higher], axis=1)
+    return half_turn(
+        Gaussians(
+            _points(points, header).astype(np.float32),
+            (scales.reshape(n, 3) / 16 - 10).astype(np.float32),
+            _unpack_rotation(rotations.reshape(n, 3 if header.version < 3 else 4))[:, [3, 0, 1, 2]],
+            logits_of_alpha(alphas),
+            sh.astype(np.float32),
+        )
     )
 
 
@@ -262,5 +291,4 @@ def _unpack_rotation(stream: np.ndarray) -> np.ndarray:
 def _pack_bands(sh: np.ndarray) -> np.ndarray:
     """Coefficients above band 0 [n, k, 3] as bytes around 128, rounded to steps of which 128 is one."""
     step = np.where(np.arange(sh.shape[1]) < 3, *SH_STEPS)[:, None]
-    signed = sh.astype(np.float64) * _FLIP_SH[: sh.shape[1], None]
-    return _byte(np.rint(signed * 128 / step) * step + 128)
+    return _byte(np.rint(sh.astype(np.float64) * 128 / step) * step + 128)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from calibration.rig import Rig
     from packuv.gaussians.uvsize import UvOptions
     from packuv.interchange import SplatFormat
+    from packuv.interchange.clip import Clip
     from packuv.scene import Scene
 
 
@@ -22,57 +25,86 @@ if TYPE_CHECKING:
 
 
 def export_frames(arguments: argparse.Namespace) -> int:
-    """`packuv export SCENE`: one frame as a file, or several as a folder of files, of another program.
+    """`packuv export SCENE`: one frame as a file, several as a folder of files or one, of another program.
 
-    Such files know no light: each frame goes out as it is seen in its own.
+    Such files know no light: each frame goes out as it is seen in its own, or in steady light where asked.
     """
-    from packuv.files import whole_folder
+    from packuv.interchange.clip import Clip, ClipOptions, Part
     from packuv.scene import open_scene
 
     kind = _splat_format(arguments.format, arguments.output)
+    options = ClipOptions(Part(arguments.part), arguments.light == "baked", arguments.keep_rows)
     with open_scene(arguments.scene) as scene:
         if arguments.frame is not None:
             check_frame(len(scene), arguments.frame)
-            count, far = _export_frame(scene, arguments.frame, arguments.output, kind)
-            print(f"{arguments.output}: {count:,} Gaussians of frame {arguments.frame}{_far_text(far)}")
-            return 0
-        frames, left = frames_of(len(scene), arguments.frames), 0
-        with whole_folder(arguments.output) as folder, shown(arguments, "export") as progress:
-            for done, frame in enumerate(frames, start=1):
-                left += _export_frame(scene, frame, folder / f"{frame:06d}{kind.suffix}", kind)[1]
-                progress(done, len(frames))
-    print(f"{arguments.output}: {len(frames)} files, frames {frames.start} to {frames.stop - 1}{_far_text(left)}")
+            frames = range(arguments.frame, arguments.frame + 1)
+        else:
+            frames = frames_of(len(scene), arguments.frames)
+        with shown(arguments, "export") as progress:
+            clip = Clip(scene, frames, options, progress=progress)
+            count, what = _write_clip(clip, arguments, kind)
+        print(f"{arguments.output}: {what}")
+        for line in _told(clip, kind, count):
+            print(line)
     return 0
 
 
-def _export_frame(scene: Scene, frame: int, path: Path, kind: SplatFormat) -> tuple[int, int]:
-    """How many Gaussians are in the file, and how many that are drawn are not."""
-    from packuv.gaussians.floats import drawn, lit_gaussians
+def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat) -> tuple[int, str]:
+    """How many drawn Gaussians went out, and what was written."""
+    from packuv.files import save_json, whole_folder
     from packuv.interchange import write_gaussians
-    from packuv.interchange.adopt import ANTIALIASED
 
-    gaussians = lit_gaussians(scene.gaussians(frame), scene.light(frame))
-    smooth = scene.header.extra.get(ANTIALIASED) is True
-    count = write_gaussians(path, gaussians, kind=kind, antialiased=smooth)
-    return count, len(drawn(gaussians)) - count
+    frames, output = clip.frames, arguments.output
+    span = f"frame {frames[0]}" if len(frames) == 1 else f"frames {frames.start} to {frames.stop - 1}"
+    if kind.door.write_clip is not None:
+        if output.suffix.lower() not in kind.door.suffixes:
+            raise ValueError(f"{kind} is one file, named {' or '.join(kind.door.suffixes)}, but not {output.name}")
+        count = kind.door.write_clip(output, clip)
+        return count, f"{count:,} Gaussians of {span}"
+    write = partial(write_gaussians, kind=kind, antialiased=clip.antialiased, keep_rows=clip.options.keep_rows)
+    if arguments.frame is not None:
+        count = write(output, clip.frame(arguments.frame))
+        return count, f"{count:,} Gaussians of {span}"
+    count = 0
+    with whole_folder(output) as folder:
+        for frame, gaussians in zip(frames, clip, strict=True):
+            count += write(folder / f"{frame:06d}{kind.suffix}", gaussians)
+        if not clip.options.bake_light:
+            save_json(folder / "light.json", {"frames": list(frames), "gains": clip.gains.tolist()})
+    return count, f"{len(frames)} files, {span}"
 
 
-def _far_text(count: int) -> str:
-    """What SPZ's fixed point leaves out."""
-    return f"; {count:,} left out, so far away that positions of the others would be coarse" if count else ""
+def _told(clip: Clip, kind: SplatFormat, count: int) -> Iterator[str]:
+    """What went otherwise than in the scene: what the format loses, is left out, or was made of light and rows."""
+    yield f"format     {kind.door.lacks}"
+    if left := clip.drawn - count:  # by SPZ's fixed point
+        yield f"left out   {left:,} of {clip.drawn:,} Gaussians, so far away that others would have coarse positions"
+    if clip.options.keep_rows:
+        starts = [clip.frames[k] for k, (a, b) in enumerate(pairwise([-1, *clip.segments])) if a != b]
+        yield f"rows       are the same Gaussians until they begin anew at frames {', '.join(map(str, starts))}"
+    if (clip.gains == 1).all():
+        return
+    if clip.options.bake_light:
+        rms, largest = (255 * value for value in (clip.baking.rms, clip.baking.largest))
+        yield (
+            f"light      is baked into colours, {rms:.2f} of 255 off in the worst frame, {largest:.1f} at most: "
+            "gains are of linear light, SH of sRGB"
+        )
+    else:
+        low, high = clip.gains.min(), clip.gains.max()
+        yield f"light      is left out: of {low:.1%} to {high:.1%} of steady light, in which frames are written"
 
 
 def _splat_format(name: str | None, output: Path) -> SplatFormat:
     """As asked for, or else by the file's name; a folder of frames gets standard PLY."""
-    from packuv.interchange import SplatFormat
+    from packuv.interchange import WRITTEN, SplatFormat, format_of
 
-    if name:
-        return SplatFormat(name)
-    longest_first = sorted(SplatFormat, key=lambda kind: -len(kind.suffix))
-    found = [kind for kind in longest_first if output.name.lower().endswith(kind.suffix)]
-    if not found and output.suffix:
-        raise ValueError(f"{output.name} does not tell its format; choose one with --format: {', '.join(SplatFormat)}")
-    return found[0] if found else SplatFormat.PLY
+    found = SplatFormat(name) if name else format_of(output)
+    if found is None and not output.suffix:
+        return SplatFormat.PLY
+    if found not in WRITTEN:
+        raise ValueError(f"{output.name} does not tell its format; choose one with --format: {', '.join(WRITTEN)}")
+    return found
 
 
 def import_splats(arguments: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import runpy
 import sys
 from typing import Any
@@ -15,6 +16,8 @@ from packuv.interchange import read_gaussians, write_ply
 from packuv.interchange.adopt import AdoptOptions, adopt
 from packuv.metrics import psnr
 from packuv.raster import RasterOptions, render
+from packuv.scene import verify_scene
+from tests.support.gallery import FRAMES, MOST_BYTES, PICTURES, SCENE
 from tests.support.places import ROOT
 from tests.support.splats import random_gaussians
 
@@ -45,6 +48,22 @@ def test_examples_are_short_and_say_how_to_run_them(path):
     text = path.read_text()
     assert len(text.splitlines()) <= MOST_LINES
     assert f"\n    python examples/{path.name} " in (ast.get_docstring(ast.parse(text)) or "")
+
+
+def test_the_scene_is_whole_and_small():
+    assert SCENE.stat().st_size <= MOST_BYTES
+    assert verify_scene(SCENE).ok
+    with packuv.open_scene(SCENE) as scene:
+        assert 2 <= len(scene) <= FRAMES
+        assert scene.header.cameras
+
+
+def test_pictures_are_small_and_shown():
+    pictures = sorted(PICTURES.iterdir())
+    assert sum(path.stat().st_size for path in pictures) <= MOST_BYTES
+    text = "".join(path.read_text() for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")))
+    assert [path.name for path in pictures if f"pictures/{path.name})" not in text] == []
+    assert all((PICTURES / name).is_file() for name in re.findall(r"pictures/(\w+\.webp)\)", text))
 
 
 def test_convert_splat(run, splats, tmp_path, capsys):

@@ -34,7 +34,8 @@ from packuv.camera import PinholeCamera
 from packuv.files import load_json
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
-from packuv.interchange import read_gaussians, write_compressed_ply, write_ply, write_spz
+from packuv.interchange import read_gaussians, write_compressed_ply, write_ply
+from packuv.interchange.spz import write_spz_3
 from packuv.scene import SceneHeader, open_scene, verify_scene, write_scene
 from packuv.scene.header import CHECKSUM, HEADER
 from packuv.scene.lookahead import DamageError
@@ -217,7 +218,7 @@ def splat_files(folder: Path) -> dict[str, bytes]:
     """Small valid files of every kind, by suffix."""
     gaussians = random_gaussians(20, 1)
     found = {".sog": sog(sog_files())}
-    for suffix, write in ((".ply", write_ply), (".compressed.ply", write_compressed_ply), (".spz", write_spz)):
+    for suffix, write in ((".ply", write_ply), (".compressed.ply", write_compressed_ply), (".spz", write_spz_3)):
         write(folder / f"valid{suffix}", gaussians)
         found[suffix] = (folder / f"valid{suffix}").read_bytes()
     found[".splat"], (found[".ksplat"], _) = splat_bytes(gaussians), ksplat_bytes(gaussians, 2)

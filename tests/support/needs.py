@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-KINDS = ("avx2", "cuda", "nvvm", "ffmpeg", "chromium", "data", "postgres", "shm", "weights")
+KINDS = ("avx2", "cuda", "nvvm", "ffmpeg", "chromium", "data", "postgres", "shm", "weights", "usd", "fourdgs")
 VARIABLE = "PACKUV_REQUIRE"
 
 

@@ -15,7 +15,7 @@ from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import OPACITY_RANGE
 from packuv.gaussians.floats import Gaussians, rotation_matrices, rows_of
 from packuv.interchange import read_gaussians, read_spz, write_spz
-from packuv.interchange.spz import _FLIP_SH
+from packuv.interchange.conventions import half_turn as turned_to
 from packuv.raster import RasterOptions, render
 from tests.support.needs import needs_data
 from tests.support.places import DATA
@@ -54,8 +54,9 @@ def test_what_is_written_is_read_within_half_a_step(tmp_path, count, degree, see
     truth = random_gaussians(count, degree, seed)
     truth.means[:] *= size
     truth.sh[:, 1:] *= 0.4
-    assert write_spz(tmp_path / "a.spz", truth) == count
-    back = read_spz(tmp_path / "a.spz")
+    assert write_spz(tmp_path / "a.spz", truth) == write_spz(tmp_path / "b.spz", truth, version=3) == count
+    back, older = (read_spz(tmp_path / name) for name in ("a.spz", "b.spz"))
+    assert all(np.array_equal(getattr(back, name), getattr(older, name)) for name in FIELDS)
     assert back.sh_degree == degree
     assert_near(back, truth)
     assert rotation_error(back, truth).max(initial=0) < ROTATION_V3
@@ -98,7 +99,7 @@ def test_one_gaussian_byte_by_byte(tmp_path):
         np.array([0.0], np.float32),
         np.array([[[0.0, 1.0, -1.0]]], np.float32),
     )
-    write_spz(tmp_path / "a.spz", gaussian)
+    write_spz(tmp_path / "a.spz", gaussian, version=3)
     body = gzip.decompress((tmp_path / "a.spz").read_bytes())
     magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<4sIIBBBB", body)
     assert (magic, version, count, degree, flags, reserved) == (b"NGSP", 3, 1, 0, 0, 0)
@@ -145,7 +146,7 @@ def times(a, b):
 def test_the_axes_of_the_file_are_a_half_turn_about_x(tmp_path):
     """Our reader, told nothing of axes, must see in the file the ellipsoids of the turned scene."""
     truth = random_gaussians(30, 0, seed=3)
-    write_spz(tmp_path / "a.spz", truth)
+    write_spz(tmp_path / "a.spz", truth, version=3)
     body = gzip.decompress((tmp_path / "a.spz").read_bytes())
     bits = body[13]
     wide = np.frombuffer(body[16 : 16 + 9 * 30], np.uint8).reshape(90, 3).astype(np.int64) @ (1, 256, 65536)
@@ -169,8 +170,7 @@ def test_signs_of_sh_are_those_of_the_half_turned_view():
     gaussian.means[:], gaussian.log_scales[:], gaussian.opacity_logits[:] = 0, -0.5, 6
     gaussian.sh[:, 0], gaussian.sh[:, 1:] = 0, rng.normal(size=(1, 15, 3)) * 0.2
     gaussian.quaternions[:] = [1, 0, 0, 0]
-    turned = half_turn(gaussian)
-    turned.sh[:, 1:] *= _FLIP_SH[:, None]
+    turned = turned_to(gaussian)
     turned.quaternions[:] = [1, 0, 0, 0]
     for seed in range(5):
         pose = np.eye(4)
@@ -190,7 +190,7 @@ def test_signs_of_sh_are_those_of_the_half_turned_view():
 
 
 def stored_streams(truth, path):
-    write_spz(path, truth)
+    write_spz(path, truth, version=3)
     body = gzip.decompress(path.read_bytes())
     sizes = np.cumsum([9, 1, 3, 3, 4, 3 * ((truth.sh_degree + 1) ** 2 - 1)]) * len(truth)
     return body[:16], [body[16 + a : 16 + b] for a, b in zip([0, *sizes[:-1]], sizes, strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from fractions import Fraction
 
@@ -123,6 +124,42 @@ def test_a_frame_goes_out_as_it_is_seen_in_its_light(scene, lit_scene, tmp_path,
     with open_scene(scene) as opened:
         truth = lit_gaussians(drawn(opened.gaussians(2)), LIGHT[2])
     assert all(np.array_equal(getattr(back, name), getattr(truth, name)) for name in ATTRIBUTES)
+
+
+def test_parts_rows_and_light_are_chosen(scene, lit_scene, tmp_path, capsys):
+    words = ["export", lit_scene, "--frames", ":", "--part", "people", "--keep-rows"]
+    assert run(*words, "--light", "left", "-o", tmp_path / "a") == OK
+    told = capsys.readouterr().out
+    assert "a: 3 files, frames 0 to 2" in told
+    assert "format     PLY keeps a frame exactly, but not its time" in told
+    assert "rows       are the same Gaussians until they begin anew at frames 0" in told
+    assert "light      is left out: of 22.3% to 182.2% of steady light" in told
+    with open_scene(scene) as opened:
+        for frame in range(3):
+            back, truth = read_gaussians(tmp_path / "a" / f"{frame:06d}.ply"), opened.gaussians(frame)
+            assert np.array_equal(back.means, truth.means[:30])
+            assert np.array_equal(back.sh, truth.sh[:30])
+    assert (back.opacity_logits < -10).sum() == 4
+    gains = json.loads((tmp_path / "a" / "light.json").read_text())
+    assert gains["frames"] == [0, 1, 2]
+    assert np.allclose(gains["gains"], np.exp(LIGHT), atol=1e-4)
+    assert run("import", tmp_path / "a", "--keep-all", "-o", tmp_path / "a.mkv") == OK
+    capsys.readouterr()
+    assert run(*words, "-o", tmp_path / "b") == OK
+    told = capsys.readouterr().out
+    assert re.search(
+        r"light      is baked into colours, \d+\.\d\d of 255 off in the worst frame, \d+\.\d at most", told
+    )
+    assert run("export", scene, "--frame", 0, "-o", tmp_path / "c.sog") == OK
+    told = capsys.readouterr().out
+    assert "light  " not in told
+    assert "left out" not in told
+
+
+def test_a_sequence_in_one_file_has_the_name_of_its_format(scene, tmp_path, capsys):
+    assert run("export", scene, "--frames", ":", "--format", "usd", "-o", tmp_path / "frames") == WRONG
+    assert "usd is one file, named .usdc or .usda or .usd, but not frames" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_pictures_are_drawn_in_the_light_of_their_frame(scene, lit_scene, tmp_path):
