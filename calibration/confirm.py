@@ -142,7 +142,8 @@ def _wide(camera: Camera, count: int) -> np.ndarray:
 
 def _squares(seen: Foreseen, miss_px: np.ndarray, noise_px: float) -> np.ndarray:
     """Squared distances [..., M] of ways [..., M, 2], in standard deviations."""
-    found: np.ndarray = np.einsum("...mi,mij,...mj->...m", miss_px, seen.weight, miss_px) / noise_px**2
+    weighed = (seen.weight @ miss_px[..., None])[..., 0]
+    found: np.ndarray = (miss_px * weighed).sum(axis=-1) / noise_px**2
     return found
 
 
@@ -164,8 +165,8 @@ def _system(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations [D, D] and [D] of numbers, of sightings as far as they fit."""
     heavy = ((squares <= options.fitting**2) / (1 + squares / 9))[:, None, None] * seen.weight
-    matrix = np.einsum("mia,mij,mjb->ab", slope, heavy, slope, optimize=True)
-    return matrix, np.einsum("mia,mij,mj->a", slope, heavy, seen.miss_px, optimize=True)
+    flat, weighed = slope.reshape(-1, slope.shape[2]), (heavy @ slope).reshape(-1, slope.shape[2])
+    return flat.T @ weighed, weighed.T @ seen.miss_px.ravel()
 
 
 def _densest(seen: Foreseen, slope: np.ndarray, noise_px: float, options: ConfirmOptions) -> tuple[float, float]:
@@ -182,7 +183,7 @@ def _densest(seen: Foreseen, slope: np.ndarray, noise_px: float, options: Confir
 
 def _left(seen: Foreseen, slope: np.ndarray, values: np.ndarray) -> np.ndarray:
     """What is left of the ways with numbers [..., D]: [..., M, 2]."""
-    left: np.ndarray = seen.miss_px - np.einsum("mid,...d->...mi", slope, values)
+    left: np.ndarray = seen.miss_px - (slope @ values[..., None, :, None])[..., 0]
     return left
 
 
