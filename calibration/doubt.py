@@ -87,13 +87,15 @@ def doubts(
         return {WHOLE: f"is neither confirmed nor refuted by the pictures: {report.reason}"}
     evidence = _of_one_geometry(rig, evidence)
     errors = _errors_px(rig, evidence)
+    limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
+    three = _by_three(rig, evidence, features, judge, limit)
     cleared = _cleared(rig, errors, options)
     known = _confirming_px(errors, judge.judge, options) | _medians_px(errors, options.accusing_matches)
-    limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
     exact = {name for key, px in known.items() if px <= options.exact * limit for name in key}
     chance = {key for key, px in known.items() if px > limit and key <= cleared}
     chance |= {key for key, px in known.items() if px > options.gross * limit and key <= exact}
-    off, left = _peeled(rig, {key: px for key, px in known.items() if key not in chance}, cleared, options)
+    known = {key: px for key, px in known.items() if key not in chance}
+    off, left = _peeled(rig, known, cleared, set(rig.names) - three.keys(), options)
     found = {name: f"lies {px:.1f} px off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
              for name, px in off.items()}  # fmt: skip
     kept = rig.select(name for name in rig.names if name not in off)
@@ -109,17 +111,13 @@ def doubts(
             f"misses the pictures by {_usual(left):.1f} px in the median, right ones by 0.1 to 0.3: focal lengths, "
             "principal points, distortion or poses are not those of these videos"
         )
-    silent = [name for name in rig.names if not any(name in key for key in known)]
-    found |= {name: f"{UNCONFIRMED}: {SILENT}" for name in silent if name not in found}
-    if WHOLE not in found:  # where all are wrong, nothing tells of one
-        rest = rig.select(name for name in rig.names if name not in found)
-        found |= _along_lines(rest, right, features, judge, limit)
-    return found
+    if WHOLE in found:  # where all are wrong, nothing tells of one
+        return found
+    return found | (_by_three(kept, right, features, judge, limit) if off else three)
 
 
 UNCONFIRMED = "is not confirmed"
 """So begins what is said of a camera that nothing speaks against, and too little for"""
-SILENT = "the pictures have too few matches with its neighbours"
 WRONG = "its pose, focal length, principal point or distortion is wrong, or its name is another camera's"
 
 
@@ -134,15 +132,14 @@ Errors = Mapping[frozenset[str], np.ndarray]
 """Likewise, of each match, float64 [K]"""
 
 
-def _along_lines(
+def _by_three(
     rig: Rig,
     evidence: Sequence[PairMatches],
     features: Sequence[Mapping[str, Features]],
     judge: TriangulateOptions,
     limit_px: float,
 ) -> dict[str, str]:
-    """What three cameras at a time say, who see what no two of them do."""
-    evidence = [pair for pair in evidence if {pair.first, pair.second} <= set(rig.names)]
+    """What three cameras at a time say, who see what no two of them do, of each that they do not confirm."""
     telling = [pair for pair in evidence if len(pair.first_pixels) >= judge.judge.min_matches]
     # A wrong camera spoils many pairs of a small rig; what the better ones say, a pixel's noise is for all.
     best = np.percentile([np.median(pair_errors_px(rig, pair)) for pair in telling] or [limit_px], 25)
@@ -214,16 +211,21 @@ def _cleared(rig: Rig, errors: Errors, options: DoubtOptions) -> set[str]:
 
 
 def _peeled(
-    rig: Rig, pairs: Medians, cleared: Collection[str], options: DoubtOptions
+    rig: Rig, pairs: Medians, cleared: Collection[str], confirmed: Collection[str], options: DoubtOptions
 ) -> tuple[dict[str, float], Medians]:
     """Cameras that lie off, the worst first, each judged without those before it; and the pairs of the others.
 
-    A wrong camera spoils all of its own pairs, but only one of each neighbour's. Half of the cameras at most: beyond
-    that it is the calibration that is wrong.
+    A wrong camera spoils all of its own pairs, but only one of each neighbour's. What misses by far says nothing
+    against a camera that three at a time confirm: it is chance, or the other one's fault. Half of the cameras at most:
+    beyond that it is the calibration that is wrong.
     """
     left, off = dict(pairs), dict[str, float]()
+    most = {c.name: options.gross * options.limit_px(c.width) for c in rig.cameras if c.name in confirmed}
     while left and 2 * (len(off) + 1) <= len(rig.cameras):
-        own = {name: {key: px for key, px in left.items() if name in key} for name in rig.names}
+        own = {
+            name: {key: px for key, px in left.items() if name in key and px <= most.get(name, np.inf)}
+            for name in rig.names
+        }
         accused = [name for name, pairs in own.items() if _accused(rig[name], pairs, options)]
         each = {name: _usual(own[name]) for name in accused if name not in cleared}
         if not each:
