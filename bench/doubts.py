@@ -4,9 +4,9 @@
 
 Rooms are simulated, their right rigs judged by three instants as an import is, and then again with one fault: of one
 camera after another a focal length that is 10 % too long, a principal point that is off by 5 % of the width, a turn by
-2 degrees, a shift by 3 % of the rig's radius, and the pose of the next camera exchanged with it. A miss is a fault that
-is neither refused nor named, a false alarm any other camera that is said to be wrong. Cameras of which the pictures say
-too little are counted apart: that is no accusation.
+2 degrees, a shift by 3 % of the rig's radius, and the pose of the next camera exchanged with it. Such a fault is named,
+or the calibration refused, or the camera is said not to be confirmed, since the pictures say too little of it; else it
+is silent. A false alarm is any other camera that is said to be wrong. Others that are not confirmed are counted apart.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ import numpy as np
 
 from bench import command
 from calibration.accept import MatchesReport, PairMatches, Verdict, matches_report
-from calibration.doubt import UNCONFIRMED, doubts
-from calibration.judge import matches_at
+from calibration.doubt import accused, doubts
+from calibration.features import Features
+from calibration.judge import seen_at
 from calibration.rig import Camera, Rig
 from packuv.footage import FrameReader
 from studio.capture import SimulateOptions, TruthKind, simulate
@@ -130,9 +131,9 @@ def gather(room: Room, work: Path, most: int) -> Iterator[dict[str, Any]]:
     folder = room.filmed(work)
     reader, rig = FrameReader(find_capture(folder).videos), right_rig(folder)
     instants = ({name: reader.read(name, index) for name in rig.names} for index in range(INSTANTS))
-    evidence = list(matches_at(rig, instants, options=JUDGE))
+    seen = list(seen_at(rig, instants, options=JUDGE))
     for fault, whom, wrong in [(RIGHT, frozenset[str](), rig), *wrong_rigs(rig, room.seed, most)]:
-        yield {"room": room.name, "cameras": room.cameras, "fault": fault, **judged(wrong, evidence, whom)}
+        yield {"room": room.name, "cameras": room.cameras, "fault": fault, **judged(wrong, seen, whom)}
 
 
 def right_rig(folder: Path) -> Rig:
@@ -143,23 +144,27 @@ def right_rig(folder: Path) -> Rig:
     )
 
 
-def judged(rig: Rig, evidence: Sequence[Sequence[PairMatches]], whom: frozenset[str]) -> dict[str, Any]:
+Seen = tuple[Mapping[str, Features], Sequence[PairMatches]]
+"""Features and matches of an instant"""
+
+
+def judged(rig: Rig, seen: Sequence[Seen], whom: frozenset[str]) -> dict[str, Any]:
     """As an import is judged: by one instant, and by more while there is a doubt."""
-    seen, said, report = list[PairMatches](), dict[str, str](), None
-    for more in evidence:
-        seen += more
-        report = matches_report(rig, seen, options=JUDGE.judge)
-        said = doubts(rig, seen, report, judge=JUDGE.judge)
+    evidence, said, report = list[PairMatches](), dict[str, str](), None
+    for count, (_, found) in enumerate(seen, start=1):
+        evidence += found
+        report = matches_report(rig, evidence, options=JUDGE.judge)
+        said = doubts(rig, evidence, report, judge=JUDGE, features=[features for features, _ in seen[:count]])
         if not said:
             break
-    accused = {name for name, what in said.items() if what != UNCONFIRMED}
+    wrong = accused(said)
     return {
         "whom": sorted(whom),
         "refused": _refused(report),
-        "named": sorted(whom & said.keys()),
-        "false": sorted((accused & set(rig.names)) - whom),
-        "unconfirmed": sorted(said.keys() - accused),
-        "whole": sorted(said.keys() - set(rig.names)),
+        "named": sorted(whom & wrong),
+        "false": sorted((wrong & set(rig.names)) - whom),
+        "unconfirmed": sorted(said.keys() - wrong),
+        "whole": sorted(wrong - set(rig.names)),
     }
 
 
@@ -169,17 +174,24 @@ def _refused(report: MatchesReport | None) -> bool:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """In Markdown: a line for each number of cameras and each fault."""
-    lines = ["| cameras | fault | trials | missed | false alarms |", "|---:|---|---:|---:|---:|"]
+    lines = [
+        "| cameras | fault | trials | named | not confirmed | silent | others accused | others not confirmed |",
+        "|---:|---|---:|---:|---:|---:|---:|---:|",
+    ]
     for cameras in sorted({row["cameras"] for row in rows}):
         for fault in (RIGHT, *FAULTS, SWAPPED):
             own = [row for row in rows if (row["cameras"], row["fault"]) == (cameras, fault)]
-            missed = sum(bool(row["whom"]) and not noticed(row) for row in own)
+            wrong = [row for row in own if row["whom"]]
+            named = sum(named_by(row) for row in wrong)
+            silent = sum(not named_by(row) and not set(row["whom"]) & set(row["unconfirmed"]) for row in wrong)
             false = sum(len(row["false"]) for row in own) + sum(row["refused"] and not row["whom"] for row in own)
-            lines.append(f"| {cameras} | {fault} | {len(own)} | {missed} | {false} |")
+            unsure = sum(len(set(row["unconfirmed"]) - set(row["whom"])) for row in own)
+            counts = (len(own), named, len(wrong) - named - silent, silent, false, unsure)
+            lines.append(f"| {cameras} | {fault} | {' | '.join(map(str, counts))} |")
     return "\n".join(lines)
 
 
-def noticed(row: Mapping[str, Any]) -> bool:
+def named_by(row: Mapping[str, Any]) -> bool:
     """Whether a fault is refused, or named, by camera or as one of the whole calibration."""
     return bool(row["refused"] or row["whole"] or row["named"])
 

@@ -3,7 +3,7 @@
 That most matches fit says little about a single camera, or about a lens that is wrong by a little: right calibrations
 explain 0.86 to 1.0 of the matches, wrong ones 0.55 to 0.98. The distance tells: matches of right cameras lie 0.1 to 0.3
 pixels from their epipolar lines, those of wrong ones 1 to 6. A camera that is wrong along its epipolar lines shows the
-points that the others locate elsewhere (`calibration.moved`).
+points that the others locate elsewhere, and one of which too few are known is not confirmed (`calibration.confirm`).
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.accept import MatchesReport, MatchOptions, PairMatches, Verdict, merged, pair_errors_px
-from calibration.moved import find_moved
+from calibration.confirm import confirm
+from calibration.features import Features
+from calibration.refine import tracks
 from calibration.rig import Camera, Rig
-from calibration.triangulate import on_one_geometry
+from calibration.triangulate import TriangulateOptions, matches_along, on_one_geometry
 
 FOCAL_SCALES = (0.8, 0.85, 0.91, 0.95, 1.05, 1.1, 1.18, 1.25)
 BENDS = (-0.3, -0.15, -0.07, -0.03, 0.03, 0.07, 0.15, 0.3)
@@ -71,59 +73,88 @@ def doubts(
     evidence: Sequence[PairMatches],
     report: MatchesReport,
     *,
-    judge: MatchOptions,
+    judge: TriangulateOptions,
+    features: Sequence[Mapping[str, Features]] = (),
     options: DoubtOptions = DoubtOptions(),
 ) -> dict[str, str]:
     """What speaks against single cameras, and against all of them: camera or WHOLE -> what, for people.
 
     `evidence` are matches found without the poses (`triangulate.verified_matches`), `report` what was made of them.
+    Cameras that these do not confirm are asked again by matches along their epipolar lines, among the `features` of
+    each instant.
     """
     if report.verdict is Verdict.UNDECIDED:
         return {WHOLE: f"is neither confirmed nor refuted by the pictures: {report.reason}"}
     evidence = _of_one_geometry(rig, evidence)
     errors = _errors_px(rig, evidence)
-    cleared = _cleared(rig, errors, options)
-    known = _confirming_px(errors, judge, options) | _medians_px(errors, options.accusing_matches)
     limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
+    three = _by_three(rig, evidence, features, judge, limit)
+    cleared = _cleared(rig, errors, options)
+    known = _confirming_px(errors, judge.judge, options) | _medians_px(errors, options.accusing_matches)
     exact = {name for key, px in known.items() if px <= options.exact * limit for name in key}
     chance = {key for key, px in known.items() if px > limit and key <= cleared}
     chance |= {key for key, px in known.items() if px > options.gross * limit and key <= exact}
-    off, left = _peeled(rig, {key: px for key, px in known.items() if key not in chance}, cleared, options)
+    known = {key: px for key, px in known.items() if key not in chance}
+    off, left = _peeled(rig, known, cleared, set(rig.names) - three.keys(), options)
     found = {name: f"lies {px:.1f} px off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
              for name, px in off.items()}  # fmt: skip
-    standings, moved = find_moved(rig, evidence)
-    for name in moved:
-        where = standings[name]
-        found.setdefault(
-            name,
-            f"stands elsewhere than the calibration says: its picture lies {where.offset_px:.1f} px off, as if it were "
-            f"turned by {where.turned_deg:.1f} degrees and shifted by {100 * where.shifted:.1f} % of the rig's radius",
-        )
     kept = rig.select(name for name in rig.names if name not in off)
     right = [
         pair
         for pair in evidence
         if not {pair.first, pair.second} & off.keys() and frozenset((pair.first, pair.second)) not in chance
     ]
-    if better := _better_lens(kept, right, judge.min_matches, options):
+    if better := _better_lens(kept, right, judge.judge.min_matches, options):
         found[WHOLE] = f"fits the pictures better with {better}: its lenses are not those of these videos"
     elif left and _usual(left) > limit:
         found[WHOLE] = (
             f"misses the pictures by {_usual(left):.1f} px in the median, right ones by 0.1 to 0.3: focal lengths, "
             "principal points, distortion or poses are not those of these videos"
         )
-    silent = [name for name in rig.names if not any(name in key for key in known)]
-    found |= {name: UNCONFIRMED for name in silent if name not in found}
-    return found
+    if WHOLE in found:  # where all are wrong, nothing tells of one
+        return found
+    return found | (_by_three(kept, right, features, judge, limit) if off else three)
 
 
-UNCONFIRMED = "is not confirmed: the pictures have too few matches with its neighbours"
+UNCONFIRMED = "is not confirmed"
+"""So begins what is said of a camera that nothing speaks against, and too little for"""
 WRONG = "its pose, focal length, principal point or distortion is wrong, or its name is another camera's"
+
+
+def accused(said: Mapping[str, str]) -> set[str]:
+    """Of what `doubts` says, whom something speaks against."""
+    return {name for name, what in said.items() if not what.startswith(UNCONFIRMED)}
+
 
 Medians = Mapping[frozenset[str], float]
 """By pair of cameras, median Sampson distance of its matches, pixels"""
 Errors = Mapping[frozenset[str], np.ndarray]
 """Likewise, of each match, float64 [K]"""
+
+
+def _by_three(
+    rig: Rig,
+    evidence: Sequence[PairMatches],
+    features: Sequence[Mapping[str, Features]],
+    judge: TriangulateOptions,
+    limit_px: float,
+) -> dict[str, str]:
+    """What three cameras at a time say, who see what no two of them do, of each that they do not confirm."""
+    telling = [pair for pair in evidence if len(pair.first_pixels) >= judge.judge.min_matches]
+    # A wrong camera spoils many pairs of a small rig; what the better ones say, a pixel's noise is for all.
+    best = np.percentile([np.median(pair_errors_px(rig, pair)) for pair in telling] or [limit_px], 25)
+    noise_px = float(np.clip(1.48 * best, limit_px / 4, limit_px))
+    wrong, unsure = confirm(rig, tracks(rig, evidence), noise_px=noise_px)
+    asked = {*wrong, *unsure}
+    if asked and features:
+        pairs = [(pair.first, pair.second) for pair in evidence if asked & {pair.first, pair.second}]
+        along = [
+            match
+            for found in features
+            for match in matches_along(rig, found, [p for p in pairs if set(p) <= found.keys()], options=judge)
+        ]
+        wrong, unsure = confirm(rig, tracks(rig, [*evidence, *along]), noise_px=noise_px)
+    return wrong | {name: f"{UNCONFIRMED}: {why}" for name, why in unsure.items()}
 
 
 def _of_one_geometry(rig: Rig, evidence: Sequence[PairMatches]) -> list[PairMatches]:
@@ -180,16 +211,21 @@ def _cleared(rig: Rig, errors: Errors, options: DoubtOptions) -> set[str]:
 
 
 def _peeled(
-    rig: Rig, pairs: Medians, cleared: Collection[str], options: DoubtOptions
+    rig: Rig, pairs: Medians, cleared: Collection[str], confirmed: Collection[str], options: DoubtOptions
 ) -> tuple[dict[str, float], Medians]:
     """Cameras that lie off, the worst first, each judged without those before it; and the pairs of the others.
 
-    A wrong camera spoils all of its own pairs, but only one of each neighbour's. Half of the cameras at most: beyond
-    that it is the calibration that is wrong.
+    A wrong camera spoils all of its own pairs, but only one of each neighbour's. What misses by far says nothing
+    against a camera that three at a time confirm: it is chance, or the other one's fault. Half of the cameras at most:
+    beyond that it is the calibration that is wrong.
     """
     left, off = dict(pairs), dict[str, float]()
+    most = {c.name: options.gross * options.limit_px(c.width) for c in rig.cameras if c.name in confirmed}
     while left and 2 * (len(off) + 1) <= len(rig.cameras):
-        own = {name: {key: px for key, px in left.items() if name in key} for name in rig.names}
+        own = {
+            name: {key: px for key, px in left.items() if name in key and px <= most.get(name, np.inf)}
+            for name in rig.names
+        }
         accused = [name for name, pairs in own.items() if _accused(rig[name], pairs, options)]
         each = {name: _usual(own[name]) for name in accused if name not in cleared}
         if not each:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from calibration.accept import MatchesReport, PairMatches, Verdict, matches_report
-from calibration.doubt import WHOLE, doubts
+from calibration.doubt import WHOLE, accused, doubts
 from calibration.features import Features, pairs_by_look
 from calibration.moved import Standing, find_moved
 from calibration.refine import Refinement, RefineOptions, refine
@@ -53,6 +53,8 @@ class Judgement:
     """By how many quarters clockwise the pictures of cameras stand otherwise than when they were calibrated"""
     evidence: Sequence[PairMatches] = ()
     """Matches of neighbouring cameras, found without the poses"""
+    features: Sequence[Mapping[str, Features]] = ()
+    """Of each instant looked at, by camera"""
     doubts: Mapping[str, str] = field(default_factory=dict)
     """What speaks against single cameras, or all of them (`calibration.doubt`)"""
     mended: Mapping[str, str] = field(default_factory=dict)
@@ -84,8 +86,9 @@ def judge(
     clockwise by a quarter, which may have been the wrong way (`calibration.turned`). Raises ValueError for pictures
     that do not fit the rig, and when no reading gives the cameras a common volume.
     """
-    found = _looked(rig, pictures, turned, options)
-    return replace(found, doubts=doubts(found.rig, found.evidence, found.matches, judge=options.judge))
+    features = detect_all(rig, pictures, options=options.features)
+    found = _upright(rig, features, turned, options) if turned else _judge(rig, features, options)
+    return _doubted(replace(found, features=(features,)), options)
 
 
 def look_again(
@@ -95,28 +98,35 @@ def look_again(
 
     Cameras start late, and a scene may show little at one instant.
     """
-    rig, evidence = judgement.rig, list(judgement.evidence)
-    for found_there in matches_at(rig, instants, options=options):
-        evidence += found_there
-        matches = matches_report(rig, evidence, options=options.judge)
-        found = doubts(rig, evidence, matches, judge=options.judge)
-        judgement = replace(judgement, matches=matches, evidence=evidence, doubts=found)
-        if not found:
+    for features, found in seen_at(judgement.rig, instants, options=options):
+        evidence = [*judgement.evidence, *found]
+        judgement = replace(judgement, evidence=evidence, features=[*judgement.features, features])
+        judgement = _doubted(judgement, options)
+        if not judgement.doubts:
             break
     return judgement
 
 
+def _doubted(judgement: Judgement, options: TriangulateOptions) -> Judgement:
+    """The judgement with what its evidence says of its rig."""
+    matches = matches_report(judgement.rig, judgement.evidence, options=options.judge)
+    found = doubts(judgement.rig, judgement.evidence, matches, judge=options, features=judgement.features)
+    return replace(judgement, matches=matches, doubts=found)
+
+
 def mend(judgement: Judgement, *, options: TriangulateOptions = _DEFAULTS) -> Judgement:
     """The judgement with a rig in which what was doubted is mended, as far as the pictures tell how and confirm it."""
-    done = repair(judgement.rig, judgement.evidence, judgement.doubts.keys(), whole=WHOLE)
+    before = accused(judgement.doubts)
+    done = repair(judgement.rig, judgement.evidence, before, whole=WHOLE)
     if not done.told:
         return judgement
-    matches = matches_report(done.rig, judgement.evidence, options=options.judge)
-    left = doubts(done.rig, judgement.evidence, matches, judge=options.judge)
-    if not left.keys() < judgement.doubts.keys():
+    mended = _doubted(replace(judgement, rig=done.rig), options)
+    left = accused(mended.doubts)
+    if not left < before:
         return judgement
-    mended = {name: f"was wrong, and is mended: {what}" for name, what in done.told.items() if name not in left}
-    return replace(judgement, rig=done.rig, matches=matches, doubts=left, mended=mended)
+    told = {name: f"was wrong, and is mended: {what}" for name, what in done.told.items() if name not in left}
+    said = {name: f"{what}; it {mended.doubts[name]}" if name in mended.doubts else what for name, what in told.items()}
+    return replace(mended, mended=said)
 
 
 def refined(
@@ -138,36 +148,39 @@ def refined(
     more = [pair for found in matches_at(judgement.rig, instants, options=options) for pair in found]
     evidence = [*judgement.evidence, *more]
     done = refine(judgement.rig, evidence, options=refining)
-    matches = matches_report(done.rig, evidence, options=options.judge)
-    left = doubts(done.rig, evidence, matches, judge=options.judge)
-    if not left.keys() <= judgement.doubts.keys():
-        return replace(judgement, refined=done.declined(judgement.rig, f"it raises doubts of {', '.join(left)}"))
-    return replace(judgement, rig=done.rig, evidence=evidence, matches=matches, doubts=left, refined=done)
+    found = _doubted(replace(judgement, rig=done.rig, evidence=evidence, refined=done), options)
+    new = accused(found.doubts) - accused(judgement.doubts)
+    if new:
+        return replace(judgement, refined=done.declined(judgement.rig, f"it raises doubts of {', '.join(sorted(new))}"))
+    return found
 
 
 def matches_at(
     rig: Rig, instants: Iterable[Mapping[str, np.ndarray]], *, options: TriangulateOptions = _DEFAULTS
 ) -> Iterator[list[PairMatches]]:
     """Verified matches between neighbouring cameras, instant by instant."""
+    return (matches for _, matches in seen_at(rig, instants, options=options))
+
+
+def seen_at(
+    rig: Rig, instants: Iterable[Mapping[str, np.ndarray]], *, options: TriangulateOptions = _DEFAULTS
+) -> Iterator[tuple[dict[str, Features], list[PairMatches]]]:
+    """Features of each camera and verified matches between neighbouring ones, instant by instant."""
     pairs = choose_pairs(rig, neighbours=options.neighbours)
     for pictures in instants:
         features = detect_all(rig, pictures, options=options.features)
         near = [(first, second) for first, second in pairs if first in features and second in features]
-        yield verified_matches(rig, features, near, ratio=options.ratio)
+        yield features, verified_matches(rig, features, near, ratio=options.ratio)
 
 
-def _looked(
-    rig: Rig, pictures: Mapping[str, np.ndarray], turned: Sequence[str], options: TriangulateOptions
+def _upright(
+    rig: Rig, features: Mapping[str, Features], turned: Sequence[str], options: TriangulateOptions
 ) -> Judgement:
-    features = detect_all(rig, pictures, options=options.features)
-    if turned:
-        evidence = verified_matches(rig, features, pairs_by_look(features, ratio=options.ratio), ratio=options.ratio)
-        further = upright(rig, turned, evidence, options=options.judge)
-        rig = with_turns(rig, further)
-        judgement = _judge(rig, features, options)
-        quarters = {name: CLOCKWISE + turn + judgement.turned.get(name, 0) for name, turn in further.items()}
-        return replace(judgement, turned={**judgement.turned, **{name: turn % 4 for name, turn in quarters.items()}})
-    return _judge(rig, features, options)
+    evidence = verified_matches(rig, features, pairs_by_look(features, ratio=options.ratio), ratio=options.ratio)
+    further = upright(rig, turned, evidence, options=options.judge)
+    judgement = _judge(with_turns(rig, further), features, options)
+    quarters = {name: CLOCKWISE + turn + judgement.turned.get(name, 0) for name, turn in further.items()}
+    return replace(judgement, turned={**judgement.turned, **{name: turn % 4 for name, turn in quarters.items()}})
 
 
 def _judge(rig: Rig, features: Mapping[str, Features], options: TriangulateOptions) -> Judgement:

@@ -66,6 +66,89 @@ def misses_px(rig: Rig, sightings: Sightings, *, most_px: float = 50.0) -> np.nd
     return found
 
 
+@dataclass(frozen=True)
+class Foreseen:
+    """Sightings beside where the other cameras that show their points expect them, in undistorted pictures."""
+
+    camera: np.ndarray
+    """int32 [M], index into the rig's cameras"""
+    plane: np.ndarray
+    """float64 [M, 2], where it is expected, at z = 1"""
+    miss_px: np.ndarray
+    """float64 [M, 2], from there to where it is seen"""
+    weight: np.ndarray
+    """float64 [M, 2, 2], inverse covariance of that way, if each coordinate of a sighting is known to 1 px"""
+    slope: np.ndarray
+    """float64 [M, 2, 3], pixels by which the expected place goes when the point goes by one unit of the world"""
+
+    def of(self, camera: int) -> Foreseen:
+        """Those of one camera."""
+        return self._only(self.camera == camera)
+
+    def _only(self, kept: np.ndarray) -> Foreseen:
+        return Foreseen(self.camera[kept], self.plane[kept], self.miss_px[kept], self.weight[kept], self.slope[kept])
+
+
+def foreseen(rig: Rig, sightings: Sightings, *, max_error_px: float, min_angle_deg: float) -> Foreseen:
+    """What the others say of each sighting of a point that three cameras or more show.
+
+    Each point is located anew without the camera that is asked, so a camera that is wrong does not bend what is
+    expected of it. The worst of the others goes while it exceeds the error and two are left; where these two disagree,
+    or no two rays differ by `min_angle_deg`, nothing is expected.
+    """
+    geometry = _Geometry(rig)
+    asked, others = _without_each(sightings.only(sightings.views[sightings.point] >= 3))
+    xyz, errors, left = np.zeros((len(asked.point), 3)), np.zeros(len(others.point)), np.ones(len(others.point), bool)
+    rows = np.arange(len(left))
+    while len(rows):
+        now = others.only(np.isin(np.arange(len(left)), rows))
+        located = geometry.points(now)
+        xyz[others.point[rows[now.starts]]] = located
+        errors[rows] = geometry.errors_px(now, located)
+        worst = np.maximum.reduceat(errors[rows], now.starts)[now.point]
+        drop = (errors[rows] > max_error_px) & (errors[rows] == worst) & (now.views[now.point] > 2)
+        left[rows[drop]] = False
+        rows = np.flatnonzero(left & np.isin(others.point, others.point[rows[drop]]))  # what is located again
+    agree = np.bincount(others.point[left & (errors <= max_error_px)], minlength=len(xyz)) >= 2
+    kept = others.only(left & agree[others.point])
+    asked = asked.only(agree)
+    return _expected(geometry, asked, kept, xyz[agree], min_angle_deg)
+
+
+def _without_each(sightings: Sightings) -> tuple[Sightings, Sightings]:
+    """Each sighting as a point of its own, and the others of its point under the same number."""
+    asked, others = [np.zeros(0, int)], [np.zeros((2, 0), int)]
+    for views in np.unique(sightings.views).tolist():
+        rows = sightings.starts[sightings.views == views][:, None] + np.arange(views)  # [P, views]
+        for place in range(views):
+            asked.append(rows[:, place])
+            rest = np.delete(rows, place, axis=1)
+            others.append(np.stack([np.repeat(rows[:, place], views - 1), rest.ravel()]))
+    one, (whose, many) = np.sort(np.concatenate(asked)), np.concatenate(others, axis=1)
+    order = np.argsort(whose, kind="stable")
+    whose, many = whose[order], many[order]
+    number = np.searchsorted(one, whose).astype(np.int32)
+    return (
+        Sightings(np.arange(len(one), dtype=np.int32), sightings.camera[one], sightings.pixels[one]),
+        Sightings(number, sightings.camera[many], sightings.pixels[many]),
+    )
+
+
+def _expected(
+    geometry: _Geometry, asked: Sightings, others: Sightings, xyz: np.ndarray, min_angle_deg: float
+) -> Foreseen:
+    """Of sightings `asked`, one for each point that `others` locate at xyz [P, 3]."""
+    _, slope, _ = geometry.residuals(others, xyz)
+    known = _sums(slope.transpose(0, 2, 1) @ slope, others)  # [P, 3, 3], inverse covariance of the points
+    miss, own, depth = geometry.residuals(asked, xyz)
+    wide = (geometry.angles_deg(others, xyz) >= min_angle_deg) & (depth > 0)
+    known = known + 1e-9 * np.trace(known, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    cover = np.eye(2) + own @ np.linalg.solve(known, own.transpose(0, 2, 1)) if len(xyz) else np.zeros((0, 2, 2))
+    plane = geometry.planes(asked) + miss / geometry.focal[asked.camera]
+    found = Foreseen(asked.camera, plane, -miss, np.linalg.inv(cover), own)
+    return found._only(wide)
+
+
 class _Geometry:
     """The rig as arrays, in a frame where its middle is 0 and its size 1, which keeps the linear start well posed."""
 
@@ -75,11 +158,11 @@ class _Geometry:
         self._size = max(float(np.linalg.norm(rig.centres - self._middle, axis=1).max()), 1e-12)
         self._rotation = np.stack([camera.camera_from_world[:3, :3] for camera in rig.cameras])  # [C, 3, 3]
         self._centre = (rig.centres - self._middle) / self._size  # [C, 3]
-        self._focal = np.array([(camera.fx, camera.fy) for camera in rig.cameras])  # [C, 2]
+        self.focal = np.array([(camera.fx, camera.fy) for camera in rig.cameras])  # [C, 2]
 
     def points(self, sightings: Sightings, *, steps: int = 8) -> np.ndarray:  # [P, 3], world
         """Linear triangulation, then Gauss-Newton on Cauchy-weighted reprojection errors of 1 px scale."""
-        plane = self._plane(sightings)
+        plane = self.planes(sightings)
         unit = self._linear(sightings, plane)
         for _ in range(steps):
             residual, slope, _ = self._residuals(sightings, plane, unit)
@@ -93,8 +176,14 @@ class _Geometry:
 
     def errors_px(self, sightings: Sightings, xyz: np.ndarray) -> np.ndarray:
         """Distance in the undistorted picture, infinite behind the camera: float64 [M]."""
-        residual, _, depth = self._residuals(sightings, self._plane(sightings), (xyz - self._middle) / self._size)
+        residual, _, depth = self._residuals(sightings, self.planes(sightings), (xyz - self._middle) / self._size)
         return np.where(depth > 0, np.linalg.norm(residual, axis=1), np.inf)
+
+    def residuals(
+        self, sightings: Sightings, xyz: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # [M, 2] pixels, [M, 2, 3] slope by the point in the world, depth
+        found, slope, depth = self._residuals(sightings, self.planes(sightings), (xyz - self._middle) / self._size)
+        return found, slope / self._size, depth * self._size
 
     def angles_deg(self, sightings: Sightings, xyz: np.ndarray) -> np.ndarray:
         """Greatest angle between two rays of each point, float64 [P]."""
@@ -107,7 +196,7 @@ class _Geometry:
             np.minimum.at(least, sightings.point[apart:][same], cosine)
         return np.degrees(np.arccos(np.clip(least, -1, 1)))
 
-    def _plane(self, sightings: Sightings) -> np.ndarray:
+    def planes(self, sightings: Sightings) -> np.ndarray:
         plane = np.zeros((len(sightings.point), 2))
         for index, camera in enumerate(self._rig.cameras):
             mine = sightings.camera == index
@@ -117,7 +206,7 @@ class _Geometry:
     def _linear(self, sightings: Sightings, plane: np.ndarray) -> np.ndarray:
         """Least squares on x z - X = 0 and y z - Y = 0 in camera axes, in pixels at depth 1: float64 [P, 3]."""
         rotation, centre = self._rotation[sightings.camera], self._centre[sightings.camera]
-        rows = (plane[:, :, None] * rotation[:, 2:] - rotation[:, :2]) * self._focal[sightings.camera][:, :, None]
+        rows = (plane[:, :, None] * rotation[:, 2:] - rotation[:, :2]) * self.focal[sightings.camera][:, :, None]
         right = np.einsum("mij,mj->mi", rows, centre)  # rows (X - centre) = 0
         normal = _sums(rows.transpose(0, 2, 1) @ rows, sightings)
         push = _sums(np.einsum("mij,mi->mj", rows, right), sightings)
@@ -127,7 +216,7 @@ class _Geometry:
     def _residuals(
         self, sightings: Sightings, plane: np.ndarray, unit: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # [M, 2] pixels, [M, 2, 3] slope by the point, [M] depth
-        rotation, focal = self._rotation[sightings.camera], self._focal[sightings.camera]
+        rotation, focal = self._rotation[sightings.camera], self.focal[sightings.camera]
         local = np.einsum("mij,mj->mi", rotation, unit[sightings.point] - self._centre[sightings.camera])
         depth = local[:, 2]
         safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)

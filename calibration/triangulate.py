@@ -155,6 +155,22 @@ def verified_matches(
     return [found for found in side_by_side(verified, pairs) if found]
 
 
+def matches_along(
+    rig: Rig, features: Mapping[str, Features], pairs: Sequence[tuple[str, str]], *, options: TriangulateOptions
+) -> list[PairMatches]:
+    """Matches near the epipolar lines that the rig gives: more than are found without it, and more of them by chance.
+
+    They tell nothing of errors across these lines, and all of those along them.
+    """
+
+    def along(pair: tuple[str, str]) -> PairMatches:
+        rows, _ = _near_lines(rig, *pair, features, options)
+        a, b = (features[name].pixels[side] for name, side in zip(pair, rows.T, strict=True))
+        return PairMatches(*pair, a, b)
+
+    return side_by_side(along, pairs)
+
+
 def on_one_geometry(first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
     """Which matches, undistorted pixels float64 [N, 2] each, agree on some epipolar geometry, bool [N], or None.
 
@@ -210,10 +226,16 @@ def _shared_views(rig: Rig, centre: np.ndarray) -> np.ndarray:
 def _link(rig: Rig, first: str, second: str, features: Mapping[str, Features], options: TriangulateOptions) -> Link:
     """Matches of two cameras near each other's epipolar lines."""
     a, b = features[first], features[second]
-    band = _epipolar_band(rig[first], rig[second], a, b, options.epipolar_px)
-    rows, distances = match(a, b, ratio=options.ratio, band=band)
+    rows, distances = _near_lines(rig, first, second, features, options)
     places = np.stack([a.places[rows[:, 0]], b.places[rows[:, 1]]], axis=1)
     return Link(rig.names.index(first), rig.names.index(second), places, distances)
+
+
+def _near_lines(
+    rig: Rig, first: str, second: str, features: Mapping[str, Features], options: TriangulateOptions
+) -> tuple[np.ndarray, np.ndarray]:  # as `features.match` returns them
+    a, b = features[first], features[second]
+    return match(a, b, ratio=options.ratio, band=_epipolar_band(rig[first], rig[second], a, b, options.epipolar_px))
 
 
 def _epipolar_band(first: Camera, second: Camera, a: Features, b: Features, limit_px: float) -> Band:

@@ -10,6 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from calibration.doubt import UNCONFIRMED
 from sync.content import Content
 from tasks.report.facts import ReportInput, StageOutcome, by_camera, mean_by_frame, mean_of, still_trend
 from tasks.report.limits import LIMITS, Limits
@@ -187,11 +188,23 @@ def _alike(content: Content) -> Iterator[Finding]:
             )
 
 
+AMISS = (
+    "cameras seem to stand amiss",
+    "Look at its pictures in the section on truth and render; solve the rig anew, or ignore the camera.",
+)
+OPEN = (
+    "cameras are not confirmed by the pictures",
+    "Nothing speaks against it. Compare its pictures in the section on truth and render; texture where it and two "
+    "others look, or more instants (rig.more_instants), would tell.",
+)
+"""What cameras have in common, and what to do about it"""
+
+
 def _rig_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
     if report.check is not None:
-        cure = "Look at its pictures in the section on truth and render; solve the rig anew, or ignore the camera."
         for name, what in report.check.suspicious.items():
-            yield Finding("rig", f"{name}: {what}.", cure=cure, camera=name, many="cameras seem to stand amiss")
+            many, cure = OPEN if what.startswith(UNCONFIRMED) else AMISS
+            yield Finding("rig", f"{name}: {what}.", cure=cure, camera=name, many=many)
     yield from _colour_findings(report)
     for camera in report.rig.cameras if report.rig else ():
         worst = max(camera.gains, key=lambda gain: abs(math.log(gain)))

@@ -75,7 +75,7 @@ class PointOptions:
 class ImportRig(Stage):
     """Import the calibration of the capture and judge it by the pictures: rig.json, check.json, matches.json."""
 
-    name, version = "rig", 6
+    name, version = "rig", 7
     take: Take
     """All cameras, as filmed"""
     first: int
