@@ -34,12 +34,14 @@ from pipelines.request import STAGES, RunRequest
 from pipelines.space import check_room, missing_bytes, size_found
 from pipelines.stages import Made
 from pipelines.stages import Sequence as Stages
-from sync.capture import Capture, find_masks
+from sync.capture import Capture
+from sync.masks import find_masks, masks_unread
 from tasks.artefacts.digests import Signature
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import check_given
+from tasks.stages.masks import UNREAD
 from tasks.stages.plan import Plan
 
 LAST_OF = {
@@ -197,6 +199,7 @@ def _fitted_frames(made: Made, store: Store) -> int:
 def _spared(capture: Capture, plan: Plan, options: SequenceOptions, size: Size) -> Iterator[tuple[str, str]]:
     """Work that the capture or the settings spare."""
     fit = options.fit
+    yield from ((UNREAD, note) for note in masks_unread(capture))
     if capture.settings.rig_from:
         yield "solving the cameras", f"their rig is that of {capture.settings.rig_from}"
     elif capture.calibration is not None and not size.solved:
