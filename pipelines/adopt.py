@@ -16,13 +16,13 @@ from pathlib import Path
 from calibration.importers import Found, find_calibration
 from calibration.importers.names import natural_key
 from calibration.importers.views import SUFFIXES
+from sync.masks import LIKE_MASKS, seems_masks
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".mxf", ".m4v"})
 PICTURE_SUFFIXES = SUFFIXES - VIDEO_SUFFIXES
 _CALIBRATIONS = (".", "calib", "calibration", "cameras")
 """Where in a scene its calibration may lie"""
 _CAMERAS = (".", "videos", "images", "ims", "rgbs", "images_lr", "frames", "synced")
-_MASKS = ("masks", "mask", "seg", "fmask", "fmask_lr")
 _RECORDED = re.compile(r"_\d{10,}$")
 """When a recording began, at the end of BRICS's names"""
 _ALL_IN_ONE = re.compile(r"_(\d{5})_(\d{2})$")
@@ -42,6 +42,8 @@ class Scene:
     """A video, a folder of pictures, or the pictures themselves"""
     timecodes: Mapping[str, Path] = field(default_factory=dict)
     masks: Mapping[str, Path] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
+    """What seems to hold masks, and belongs to none of the cameras"""
     held_out: tuple[str, ...] = ()
 
 
@@ -114,7 +116,7 @@ def _scene(folder: Path, dataset: Path) -> Scene | None:
     if calibration is None or len(cameras) < 2:
         return None
     name = "-".join(folder.relative_to(dataset).parts) or folder.resolve().name
-    masks = next((own for place in _MASKS if len(own := _picture_folders(folder / place)) > 1), {})
+    read, masks = _masks(folder, cameras)
     times = {
         camera: path.with_suffix(".txt")
         for camera, path in cameras.items()
@@ -125,9 +127,22 @@ def _scene(folder: Path, dataset: Path) -> Scene | None:
         calibration,
         cameras,
         times if len(times) == len(cameras) else {},
-        {camera: path for camera, path in masks.items() if camera in cameras},
+        masks,
+        tuple(path.name for path in _sorted(folder) if path != read and seems_masks(path)),
         _held_out(calibration, cameras),
     )
+
+
+def _masks(folder: Path, cameras: Mapping[str, object]) -> tuple[Path | None, dict[str, Path]]:
+    """The first folder that holds some of these cameras, and masks by camera."""
+    for name in LIKE_MASKS:
+        for place in _sorted(folder):
+            if place.name.lower() == name and place.is_dir():
+                videos = {path.stem: path for path in _sorted(place) if path.suffix.lower() in VIDEO_SUFFIXES}
+                found = {**videos, **_picture_folders(place)}
+                if own := {camera: found[camera] for camera in cameras if camera in found}:
+                    return place, own
+    return None, {}
 
 
 def _calibration(folder: Path) -> Found | None:
@@ -139,7 +154,7 @@ def _calibration(folder: Path) -> Found | None:
 
 def _cameras(folder: Path) -> dict[str, Path | tuple[Path, ...]]:
     for place in (folder / name for name in _CAMERAS):
-        files = sorted(place.iterdir(), key=lambda path: natural_key(path.name)) if place.is_dir() else []
+        files = _sorted(place)
         videos = [path for path in files if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES]
         named = {_RECORDED.sub("", path.stem): path for path in videos}
         if len(videos) > 1:
@@ -157,8 +172,12 @@ def _cameras(folder: Path) -> dict[str, Path | tuple[Path, ...]]:
 
 def _picture_folders(place: Path) -> dict[str, Path]:
     """Folders in which pictures lie, by name."""
-    folders = sorted(place.iterdir(), key=lambda path: natural_key(path.name)) if place.is_dir() else []
-    return {path.name: path for path in folders if path.is_dir() and _shows_pictures(path)}
+    return {path.name: path for path in _sorted(place) if path.is_dir() and _shows_pictures(path)}
+
+
+def _sorted(place: Path) -> list[Path]:
+    """What is in a folder, in natural order; nothing where there is none."""
+    return sorted(place.iterdir(), key=lambda path: natural_key(path.name)) if place.is_dir() else []
 
 
 def _shows_pictures(folder: Path) -> bool:

@@ -7,6 +7,7 @@ away, so that what a run refuses is refused here; then comes the look at the mac
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,13 +35,16 @@ from pipelines.request import STAGES, RunRequest
 from pipelines.space import check_room, missing_bytes, size_found
 from pipelines.stages import Made
 from pipelines.stages import Sequence as Stages
-from sync.capture import Capture, find_masks
+from sync.capture import Capture, find_lender
+from sync.masks import find_masks, masks_unread
 from tasks.artefacts.digests import Signature
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
-from tasks.stages.calibrate import check_given
+from tasks.stages.calibrate import check_given, check_lent
+from tasks.stages.masks import UNREAD
 from tasks.stages.plan import Plan
+from tasks.stages.scale import known_of
 
 LAST_OF = {
     "sync": "sync",
@@ -156,24 +160,43 @@ class _Unread(Originals):
 
 def _size(request: RunRequest, capture: Capture, plan: Plan, root: Path, progress: Progress) -> Size:
     """How much there is to process, of frames that are matched as the run would match them, unless it did already."""
-    matching = replace(request, stop_after="sync", max_minutes=None, target_psnr=None)
+    lender = find_lender(capture)
+    with _matched(request, capture, plan, root, progress) as (groups, _):
+        size = size_found(groups, plan)
+        if request.stop_after == "sync" or lender is None:
+            return _placed(size, groups, request, capture, plan)
+        known_of(lender)
+        lending = Plan(lender.folder.absolute(), lender.videos, (), 0, None, "cpu", side_by_side=False)
+        asked = replace(request, capture=str(lender.folder.absolute()), name=None, frames=":", hold_out=())
+        with _matched(asked, lender, lending, root.parent.parent / lender.name / "store", progress) as (lent, made):
+            whole = _placed(size_found(lent, lending), lent, request, lender, lending)
+            check_lent(lent, groups, tuple(plan.videos))
+        return size if made.get("rig") else replace(size, lender=whole)
+
+
+def _placed(size: Size, groups: Path, request: RunRequest, capture: Capture, plan: Plan) -> Size:
+    """Raises what a run would of this calibration and these videos."""
+    if request.stop_after != "sync":
+        check_given(capture.calibration, groups, tuple(plan.videos), plan.first)
+    return replace(size, solved=is_solved(capture))
+
+
+@contextmanager
+def _matched(
+    request: RunRequest, capture: Capture, plan: Plan, root: Path, progress: Progress
+) -> Iterator[tuple[Path, Made]]:
+    """The groups of frames, of the store or matched now, and what of the stages up to the rig is there."""
+    matching = replace(request, stop_after="calibrate", max_minutes=None, target_psnr=None)
     made = walk(matching, (), Journal())[0] if root.is_dir() else Made()
     if (groups := made.get("sync")) and (made.get("mask_files") or not find_masks(capture)):
-        return _sized(Store(root).path(groups), request, capture, plan)
+        yield Store(root).path(groups), made
+        return
     jobs, options = jobs_of(request), options_of(request, capture, request.preset)
     with TemporaryDirectory(prefix="packuv-plan-") as folder:
         originals = _Unread(capture, Path(folder) / "file_digests.json")
         workshop = Workshop(Store(Path(folder) / "store"), originals, jobs, _Passing(progress))
         stages = Stages(workshop, plan, options, lambda stage: There(workshop.make(stage)), Made())
-        return _sized(workshop.path(stages.matched()), request, capture, plan)
-
-
-def _sized(groups: Path, request: RunRequest, capture: Capture, plan: Plan) -> Size:
-    """Raises what a run would of this calibration and these videos."""
-    size = size_found(groups, plan)
-    if request.stop_after != "sync" and not capture.settings.rig_from:
-        check_given(capture.calibration, groups, tuple(plan.videos), plan.first)
-    return replace(size, solved=is_solved(capture))
+        yield workshop.path(stages.matched()), made
 
 
 def _steps(expected: Forecast, made: Made, store: Store) -> Iterator[Step]:
@@ -197,8 +220,10 @@ def _fitted_frames(made: Made, store: Store) -> int:
 def _spared(capture: Capture, plan: Plan, options: SequenceOptions, size: Size) -> Iterator[tuple[str, str]]:
     """Work that the capture or the settings spare."""
     fit = options.fit
+    yield from ((UNREAD, note) for note in masks_unread(capture))
     if capture.settings.rig_from:
-        yield "solving the cameras", f"their rig is that of {capture.settings.rig_from}"
+        if not (size.lender and size.lender.solved):
+            yield "solving the cameras", f"their rig is that of {capture.settings.rig_from}"
     elif capture.calibration is not None and not size.solved:
         given = capture.calibration.name + "/" * capture.calibration.is_dir()
         yield "solving the cameras", f"they are imported from {given}, if the pictures confirm them"
@@ -226,8 +251,9 @@ def _skips(events: Sequence[Event]) -> Iterator[tuple[str, str]]:
 
 
 def _unknown(capture: Capture, options: SequenceOptions, size: Size, machine: Machine, pilots: bool) -> Iterator[str]:
-    if size.solved:
-        known = ", of which the lenses alone are known," if capture.calibration else ""
+    if (size.lender or size).solved:
+        given = (find_lender(capture) or capture).calibration
+        known = ", of which the lenses alone are known," if given else ""
         more = minutes_text(instants_more_seconds(size, options, machine) / 60)
         yield (
             f"the cameras{known} have to be solved by COLMAP, which is counted as from one instant of pictures full of "

@@ -41,6 +41,7 @@ SETTLE_EXPONENT = -0.75
 SECONDS: Mapping[str, float] = {
     "jobs": 0.8,
     "sync": 2.6e-4,
+    "lender": 2.6e-4,
     "rig and points": 1.7,
     "features": 0.71,
     "pairs": 0.26,
@@ -61,7 +62,7 @@ STEPS: Mapping[str, float] = {"backdrop iterations": 1.38, "keyframe iterations"
 times as much in "basketball", 1.63 times in the demo"""
 STAGE_OF: Mapping[str, str] = {
     "sync": "sync",
-    **dict.fromkeys(("rig and points", "features", "pairs", "placing"), "calibrate"),
+    **dict.fromkeys(("lender", "rig and points", "features", "pairs", "placing"), "calibrate"),
     "light": "calibrate",
     "flow": "flow",
     **dict.fromkeys(("background", "shell", "keyframes", "frames", *STEPS), "fit"),
@@ -111,6 +112,8 @@ class Size:
     """Likewise, of those to score on"""
     solved: bool = False
     """Whether nothing says where the cameras stand"""
+    lender: Size | None = None
+    """Of the take whose rig this one uses, where that rig is still to be made"""
 
     def __post_init__(self) -> None:
         if self.frames < 1 or not self.fitted:
@@ -265,10 +268,12 @@ def work_of(size: Size, options: SequenceOptions, probe: Probe) -> dict[str, flo
     fitted, scored = (_mpx(sides, options) for sides in (size.fitted, size.held_out or size.fitted[:3]))
     beside = _mpx(size.fitted[: options.evaluate.fitted_cameras], options) if size.held_out else 0.0
     gaussians, segments = fit.density.cap / 1e6, _segments(size)
+    lent = size.lender
     return {
-        "sync": frames * (len(size.fitted) + len(size.held_out)),
-        "rig and points": filmed,
-        **_solving(size, options),
+        "sync": _pictures(size),
+        "lender": _pictures(lent) if lent else 0,
+        "rig and points": filmed + (sum(width * height for width, height in lent.fitted) / 1e6 if lent else 0),
+        **_solving(lent or size, options),
         "light": frames * filmed * options.light.enabled,
         "flow": frames * fitted * picture,
         "background": fit.background.instants * fitted,
@@ -282,6 +287,10 @@ def work_of(size: Size, options: SequenceOptions, probe: Probe) -> dict[str, flo
         "verify": frames * gaussians,
         "scores": frames * scored + min(frames, GLANCE_FRAMES) * beside,
     }
+
+
+def _pictures(size: Size) -> int:
+    return size.frames * (len(size.fitted) + len(size.held_out))
 
 
 def _solving(size: Size, options: SequenceOptions) -> dict[str, float]:

@@ -21,8 +21,9 @@ from pipelines.chain import Chain, Epoch, Submit
 from pipelines.options import SequenceOptions
 from pipelines.request import STAGES
 from pipelines.space import check_space
-from sync.capture import find_capture, find_masks, find_plate
+from sync.capture import find_capture, find_plate
 from sync.clock import ClockMode
+from sync.masks import find_masks, masks_unread
 from tasks.artefacts.jobs import CancelledError
 from tasks.artefacts.stage import Files, Stage
 from tasks.artefacts.store import Key
@@ -42,7 +43,7 @@ from tasks.stages.fitting import (
 )
 from tasks.stages.footage import MaskedTake, PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
-from tasks.stages.masks import CheckMasks, CheckUnseenMasks, MatchMasks, believed
+from tasks.stages.masks import UNREAD, CheckMasks, CheckUnseenMasks, MatchMasks, believed
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.scale import ScaleRig, known_of
@@ -170,6 +171,8 @@ class Sequence:
 
     def _match_masks(self) -> None:
         capture, workshop = self.workshop.capture, self.workshop
+        for note in masks_unread(capture):
+            workshop.listener.skipped(UNREAD, note)
         if masks := find_masks(capture):
             videos = workshop.files({camera: capture.videos[camera] for camera in masks}, "reading videos")
             # Nothing is made of it: who only looks goes on, and a cancelled run ends where it works next.

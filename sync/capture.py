@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import re
 import tomllib
 import unicodedata
 from collections import Counter
@@ -21,7 +21,7 @@ from sync.chapters import unjoined
 from sync.clock import ClockMode
 from sync.natural import natural_key
 from sync.offsets import MOST_OFFSET_S, find_offsets, offset_notes, read_offsets
-from sync.pictures import PICTURE_SUFFIXES, Pictures, holds_pictures, is_picture, list_pictures
+from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
 from sync.probe import VideoInfo, container_timecodes, probe_video
 from sync.timecode import NANOSECONDS, SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
 
@@ -42,8 +42,8 @@ BEGUN_APART_S, CLOCKS_SET_S = 1.5, 3600
 set"""
 SHARED_TIMECODES, SHARED_SUFFIXES = "timestamps.csv", (".csv", ".tsv")
 SETTINGS = "capture.toml"
-MASKS = "masks"
-"""Folder of foreground masks"""
+MASKS_OF = re.compile(r"(.+)[_.-](?:f?masks?|mattes?|alpha|pha|seg)", re.IGNORECASE)
+"""What masks beside a camera's video are called"""
 SOLVE = "solve"
 """Value of `calibration` in capture.toml that asks for a fresh solution although a calibration lies in the folder."""
 TRANSFERS = ("sdr", "hlg", "pq", "slog3", "vlog", "clog3", "logc3", "logc4", "log3g10", "linear")
@@ -112,7 +112,7 @@ class CaptureSettings:
         known = set(cls.__dataclass_fields__)
         for key in data:
             if key not in known:
-                raise ValueError(f"{path}: unknown key {key!r}{_suggest(key, known)}; known are {sorted(known)}")
+                raise ValueError(f"{path}: unknown key {key!r}{suggest(key, known)}; known are {sorted(known)}")
         return cls(**{key: _checked(path, key, value) for key, value in data.items()})
 
 
@@ -158,6 +158,7 @@ def find_capture(folder: Path) -> Capture:
             f"{folder} must hold videos of at least two cameras that are not ignored, but has {list(kept)}"
             f"{_advice(_passed_over(folder, inside, videos))}"
         )
+    _check_masks(folder, kept)
     timecodes = _find_timecodes(folder, videos)
     if settings.rig_from is not None and settings.calibration is not None:
         raise ValueError(f"{path}: the rig comes from rig_from or from calibration, not both; take one of them out")
@@ -176,7 +177,7 @@ def find_capture(folder: Path) -> Capture:
 
 def holds_pictures_of_cameras(folder: Path) -> bool:
     """Whether a folder holds pictures or videos by camera as data sets publish them: images/<camera>/*.jpg."""
-    return any(_cameras(folder / name) for name in VIDEO_FOLDERS[1:] if (folder / name).is_dir())
+    return any(cameras_in(folder / name) for name in VIDEO_FOLDERS[1:] if (folder / name).is_dir())
 
 
 def find_lender(capture: Capture) -> Capture | None:
@@ -223,61 +224,6 @@ def find_plate(capture: Capture) -> dict[str, Path]:
     if not any(camera in capture.videos for camera in videos):
         raise ValueError(f"{folder} must have videos of {list(capture.cameras)}, but has {list(videos)}")
     return {camera: videos[camera] for camera in capture.cameras if camera in videos}
-
-
-def find_masks(capture: Capture) -> dict[str, Path]:
-    """Foreground masks by camera, of those of this capture's cameras that have some; opens none.
-
-    Raises ValueError where masks/ holds none, or some of what is no camera.
-    """
-    inside, wanted = capture.folder / MASKS, "<camera>/000000.png or <camera>.mp4"
-    if not os.path.lexists(inside):
-        return {}
-    if not inside.is_dir():
-        raise ValueError(f"{inside} must be a folder that holds masks as {wanted}, but is none; rename it")
-    if loose := sorted((path.name for path in inside.iterdir() if is_picture(path.name)), key=natural_key):
-        raise ValueError(
-            f"{inside} must hold masks as {wanted}, but pictures lie in no camera's folder: {len(loose)}, the first of "
-            f"them {loose[0]}; move those of each camera into a folder with its name"
-        )
-    found, ignored = _by_camera(inside, _cameras(inside)), capture.settings.ignore
-    folders = [path for path in inside.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    if empty := sorted(path for path in folders if not holds_pictures(path)):
-        raise ValueError(f"{empty[0]} must hold numbered masks, as 000000.png, but holds none; add them or take it out")
-    if not found:
-        raise ValueError(f"{inside} must hold masks as {wanted}, but holds none; take it out")
-    if unknown := [camera for camera in found if camera not in capture.videos and camera not in ignored]:
-        raise ValueError(
-            f"{found[unknown[0]]} belongs to no video{_suggest(unknown[0], capture.videos)}; name it like its video"
-        )
-    return {camera: found[camera] for camera in capture.cameras if camera in found}
-
-
-def check_masks(capture: Capture, camera: str) -> tuple[int, int]:
-    """Width and height of the pictures of a camera with masks; raises ValueError unless it has as many masks as its
-    video has frames, with the same numbers."""
-    path, video = find_masks(capture)[camera], capture.videos[camera]
-    masks, info = list_pictures(path) if path.is_dir() else None, probe_video(video, listen=False)
-    if masks and masks.empty:
-        name = path / masks.empty[0]
-        raise ValueError(f"{name} is an empty file, but must hold a mask; copy it again, or make it anew")
-    count = len(masks) if masks else probe_video(path, listen=False).frame_count
-    if count != info.frame_count:
-        raise ValueError(
-            f"{path} must have a mask for each of the {info.frame_count} frames of {camera}, but has {count}"
-            f"{_without_number(masks)}; add those that are missing, or take it out"
-        )
-    if masks and video.is_dir() and not np.array_equal(masks.numbers, wanted := list_pictures(video).numbers):
-        odd = int(np.flatnonzero(masks.numbers != wanted)[0])
-        raise ValueError(
-            f"{path} must have masks with the numbers of the pictures of {camera}, but frame {odd} is picture "
-            f"{wanted[odd]} and mask {masks.numbers[odd]}; number them alike"
-        )
-    return info.width, info.height
-
-
-def _without_number(masks: Pictures | None) -> str:
-    return f", and {masks.others[0]} without a number" if masks and masks.others else ""
 
 
 def probe_capture(
@@ -609,9 +555,9 @@ def _find_videos(folder: Path) -> tuple[Path, dict[str, Path]]:
     places = [folder / name for name in VIDEO_FOLDERS if (folder / name).is_dir()]
     if not places:
         raise ValueError(f"{folder} is no capture: it must have a folder 'videos' with one file per camera")
-    inside = next((place for place in places if _cameras(place)), places[0])
+    inside = next((place for place in places if cameras_in(place)), places[0])
     _check_joined(folder, inside)
-    videos = _by_camera(inside, _cameras(inside))
+    videos = by_camera(inside, cameras_in(inside))
     for camera in videos:
         # a line break would be lines of its own in a COLMAP model, which also reads names of cameras from paths of
         # other systems; an escape sequence would be a command to the terminal
@@ -633,8 +579,18 @@ def _check_joined(folder: Path, inside: Path) -> None:
         )
 
 
-def _cameras(inside: Path) -> list[Path]:
-    """Videos, and folders of numbered pictures."""
+def _check_masks(folder: Path, videos: Mapping[str, Path]) -> None:
+    """Raises ValueError for what is named as masks of another camera, and would be filmed pictures otherwise."""
+    for camera, path in videos.items():
+        if (match := MASKS_OF.fullmatch(camera)) and match[1] in videos:
+            raise ValueError(
+                f"{path} seems to be masks of {match[1]}, and would be a camera of its own; move it to masks/"
+                f"{match[1]}{path.suffix if path.is_file() else ''}, or list it under 'ignore' in {folder / SETTINGS}"
+            )
+
+
+def cameras_in(inside: Path) -> list[Path]:
+    """Videos, and folders of numbered pictures, in no order."""
     seen = [path for path in inside.iterdir() if not path.name.startswith(".")]
     files = [path for path in seen if path.suffix.lower() not in SIDECAR_SUFFIXES | PICTURE_SUFFIXES and path.is_file()]
     return files + [path for path in seen if path.is_dir() and holds_pictures(path)]
@@ -655,7 +611,7 @@ def _passed_over(folder: Path, inside: Path, videos: Mapping[str, Path]) -> tupl
             f"camera belong in a folder of its own, as {inside.name}/cam01/000000.png"
         )
     for name in VIDEO_FOLDERS:
-        if (other := folder / name) != inside and other.is_dir() and (there := _cameras(other)):
+        if (other := folder / name) != inside and other.is_dir() and (there := cameras_in(other)):
             notes.append(
                 f"{name}/ holds {len(there)} cameras, too, and is passed over: those of {inside.name}/ are read"
             )
@@ -695,14 +651,15 @@ def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]
     if shared:
         others = [path.name for path in files if path not in shared]
         raise ValueError(f"{inside} must hold {SHARED_TIMECODES} or one file per camera, but has it and {others}")
-    found = _by_camera(inside, files)
+    found = by_camera(inside, files)
     for camera in found:
         if camera not in videos:
-            raise ValueError(f"{found[camera]} belongs to no video{_suggest(camera, videos)}; name it like its video")
+            raise ValueError(f"{found[camera]} belongs to no video{suggest(camera, videos)}; name it like its video")
     return found
 
 
-def _by_camera(folder: Path, files: Iterable[Path]) -> dict[str, Path]:
+def by_camera(folder: Path, files: Iterable[Path]) -> dict[str, Path]:
+    """In natural order. Raises ValueError for two of one camera."""
     found: dict[str, Path] = {}
     named = {path: path.name if path.is_dir() else path.stem for path in files}
     for path in sorted(named, key=lambda path: (natural_key(named[path]), path.name)):
@@ -748,7 +705,7 @@ def _check_names(path: Path, settings: CaptureSettings, videos: Mapping[str, Pat
         value = getattr(settings, key)
         for camera in (value,) if isinstance(value, str) else value or ():
             if camera not in videos:
-                raise ValueError(f"{path}: {key} names {camera!r}, which has no video{_suggest(camera, videos)}")
+                raise ValueError(f"{path}: {key} names {camera!r}, which has no video{suggest(camera, videos)}")
     both = [camera for camera in (settings.reference, *settings.held_out) if camera in settings.ignore]
     if both:
         raise ValueError(f"{path}: {both} cannot be ignored and used as reference or held out")
@@ -777,7 +734,7 @@ def _checked(path: Path, key: str, value: Any) -> Any:
     except ValueError as error:
         raise ValueError(f"{path}: {key}: {error}; clocks are {[str(mode) for mode in ClockMode]}") from None
     if key == "transfer" and value not in TRANSFERS:
-        close = _suggest(str(value), TRANSFERS)
+        close = suggest(str(value), TRANSFERS)
         raise ValueError(f"{path}: transfer must be one of {', '.join(TRANSFERS)}, but is {value!r}{close}")
     if key == "time_offset_s":
         return _checked_offsets(path, value)
@@ -829,6 +786,7 @@ def _checked_up(path: Path, value: Any) -> str | tuple[float, float, float]:
     return x, y, z
 
 
-def _suggest(name: str, known: Iterable[str]) -> str:
+def suggest(name: str, known: Iterable[str]) -> str:
+    """The end of a message about a name that nobody knows."""
     close = get_close_matches(name, list(known), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""

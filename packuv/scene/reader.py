@@ -65,8 +65,13 @@ class Scene:
 
     @property
     def damage(self) -> str:
-        """What is wrong with the header or its second copy, of which the other was read; empty if nothing is."""
+        """What is wrong with the header or its second copy, of which the other was read, or with the file's length;
+        empty if nothing is."""
         return self._source.damage
+
+    def damage_around(self) -> str:
+        """The same, and whether any byte outside of the packets is another than was written; reads them."""
+        return self._source.damage_around()
 
     @property
     def lossless(self) -> bool:

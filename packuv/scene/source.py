@@ -8,7 +8,7 @@ import os
 import zlib
 from pathlib import Path
 
-from packuv.scene.copy import Copy, CopyDamageError, read_copy
+from packuv.scene.copy import AROUND, Copy, CopyDamageError, digest_around, read_copy, segment_end
 from packuv.scene.header import CHECKSUM, HEADER, HeaderDamageError, SceneIndex
 from packuv.scene.matroska import Decoder, FoundPacket, Reader
 
@@ -32,6 +32,7 @@ class Source:
             self._copy = read_copy(self._file)
         except CopyDamageError as error:
             self.damage = f"{self._path}: {error}"
+        self.damage = self._cut() or self.damage
         self._reader: Reader | None = None
         self.index = self._read_index()
         self._times_ms = self.index.header.times_ms
@@ -40,6 +41,31 @@ class Source:
         self._file.close()
         if self._reader:
             self._reader.close()
+
+    def damage_around(self) -> str:
+        """What `damage` says, and whether any byte that lies in no packet is another than was written; reads them."""
+        if self.damage or not (self._copy and self._copy.around):
+            return self.damage
+        spans = (
+            (position, position + size)
+            for track, places in zip(self.index.tracks, self._copy.positions, strict=True)
+            for position, size in zip(places, track.sizes, strict=True)
+        )
+        fits = segment_end(self._file) == self._file.seek(0, os.SEEK_END)
+        whole = fits and digest_around(self._file, spans, self._copy.start) == self._copy.around
+        return "" if whole else f"{self._path}: {AROUND}"
+
+    def _cut(self) -> str:
+        """What is wrong with the file's length."""
+        size, end = self._file.seek(0, os.SEEK_END), segment_end(self._file)
+        if end is None or end == size:
+            return ""
+        if size < end:
+            return (
+                f"{self._path} is cut short: it must have {end} bytes, but has {size}; frames whose pictures are there "
+                "play, but copy the file again"
+            )
+        return f"{self._path} must have {end} bytes, but has {size}: something else follows; copy the file again"
 
     def decoder(self, track: int) -> Decoder:
         """A new decoder for a track."""

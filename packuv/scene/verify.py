@@ -26,7 +26,8 @@ class VerifyReport:
     span: tuple[int, int] | None = None
     """Bytes of that packet in the file, half-open, unless it is missing"""
     header: str = ""
-    """What is wrong with the header or its second copy, of which the other was read; costs no frame"""
+    """What is wrong with the header, its second copy, the file's length or the bytes around its pictures; what
+    that costs is in `bad`"""
 
     @property
     def ok(self) -> bool:
@@ -46,7 +47,7 @@ def verify_scene(path: Path, *, threads: int = 0, progress: Progress = no_progre
                 if trouble:
                     found.append((frame, trouble))
                 progress(frame + 1, len(scene))
-        count, header = len(scene), scene.damage
+        count, header = len(scene), scene.damage_around()
     if not found:
         return VerifyReport(count, problem=header, header=header)
     first = found[0][1]

@@ -20,7 +20,8 @@ from pipelines.options import compose
 from pipelines.register import find_runs
 from pipelines.request import RunRequest
 from pipelines.stages import Sequence  # which imports every stage
-from sync.capture import SETTINGS, Capture, CaptureSettings, find_capture, find_lender, find_masks, find_plate
+from sync.capture import SETTINGS, Capture, CaptureSettings, find_capture, find_lender, find_plate
+from sync.masks import find_masks
 from tasks.artefacts.digests import signature
 from tasks.artefacts.recipe import digest, plain
 from tasks.artefacts.retention import RUN

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from pipelines.adopt import Scene, adopt, find_scenes
 from pipelines.commands.terminal import print_facts, print_table
+from sync.masks import MASKS, WANTED
 
 
 def command(arguments: argparse.Namespace) -> int:
@@ -24,6 +25,12 @@ def command(arguments: argparse.Namespace) -> int:
         print_facts({"captures": [_facts(scene, folder) for scene, folder in made]}, True, str)
     else:
         print_table(_table([_facts(scene, folder) for scene, folder in made]))
+        for scene, folder in made:
+            for name in scene.unread:
+                print(
+                    f"{scene.name}: {name} seems to hold masks, but of none of its cameras, and is not linked; lay "
+                    f"them into {folder / MASKS}, as {WANTED}"
+                )
     return 0
 
 
@@ -34,6 +41,7 @@ def _facts(scene: Scene, folder: Path) -> dict[str, Any]:
         "cameras": len(scene.cameras),
         "held_out": list(scene.held_out),
         "masks": len(scene.masks),
+        "masks_unread": list(scene.unread),
         "timecodes": len(scene.timecodes),
     }
 

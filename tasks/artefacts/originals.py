@@ -15,7 +15,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from sync.capture import SETTINGS, Capture, find_capture, find_masks
+from sync.capture import SETTINGS, Capture, find_capture
+from sync.masks import find_masks
 from tasks.artefacts.digests import FileDigests, Signature, signature
 
 ADVICE = "put back what was there, or run the same command again to process what is there now"

@@ -289,11 +289,12 @@ def _motion_findings(report: ReportInput) -> Iterator[Finding]:
 
 
 def _mask_findings(report: ReportInput) -> Iterator[Finding]:
+    yield from (Finding("motion", f"{note}.") for note in report.unread_masks)
     for name, why in report.masks.items():
         yield Finding(
             "motion",
             f"Masks of {name} are not used: {why}.".replace("?.", "?"),
-            cure="Lay a mask over the picture of its number; make the masks anew, or take them out of masks/.",
+            cure="Lay a mask over the picture of its number; make the masks anew, or take them out of the capture.",
             camera=name,
             many="cameras have masks that do not fit what moves and are not used",
         )

@@ -16,7 +16,7 @@ from calibration.held_out import balance_held_out
 from calibration.importers import find_calibration, holds_lenses_alone, load_lenses, load_rig
 from calibration.judge import Judgement, SharedJudgement, judge, judge_shared, look_again, matches_at, mend, refined
 from calibration.refine import LEVELS, PLACES, SOLVED, Refinement, RefineOptions, refine, sway
-from calibration.rig import Rig
+from calibration.rig import Camera, Rig
 from calibration.solve import SolveOptions, solve_rig
 from calibration.triangulate import SparsePoints, TriangulateOptions, triangulate
 from calibration.turned import fitted
@@ -298,6 +298,15 @@ def check_given(source: Path | None, groups: Path, cameras: tuple[str, ...], fir
     if source is not None:
         load_lenses(source, cameras, sizes)
     complete_instants(FrameGroups.load(groups), cameras, first)
+
+
+def check_lent(lender: Path, groups: Path, cameras: tuple[str, ...]) -> None:
+    """Raise what `BorrowRig` raises before it looks at pictures: of a camera that films in another shape than in the
+    take whose rig it uses; `lender` and `groups` are sync artefacts of the two."""
+    lent, own = read_videos(lender), read_videos(groups)
+    for name in cameras:
+        width, height = lent[name]["width"], lent[name]["height"]
+        Camera(name, width, height, 1, 1, 0, 0, np.eye(4)).resized(own[name]["width"], own[name]["height"])
 
 
 def borrow_rig(

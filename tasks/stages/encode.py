@@ -33,7 +33,7 @@ SCENE = "scene.mkv"
 class Encode(Stage):
     """Write the scene file from the segments, in order; by default lossless."""
 
-    name, version = "encode", 4
+    name, version = "encode", 5
     take: Take
     """All cameras"""
     held_out: tuple[str, ...]
@@ -75,7 +75,7 @@ class Verify(Stage):
     Fails on a difference beyond the tolerance that the scene states.
     """
 
-    name, version = "verify", 3
+    name, version = "verify", 4
     scene: Key
     segments: tuple[Key, ...]
 

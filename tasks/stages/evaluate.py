@@ -23,8 +23,9 @@ from packuv.progress import Progress
 from packuv.scene import SceneHeader, open_scene
 from packuv.score import Likeness, Score, glance, score, segment_starts, spread, summary, write_pictures, write_table
 from sync.align import AlignOptions, FrameGroups, align
-from sync.capture import find_capture, find_masks, load_timecodes, probe_capture
+from sync.capture import find_capture, load_timecodes, probe_capture
 from sync.clock import ClockMode
+from sync.masks import find_masks
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.report.facts import FrameScore, frames_to_picture

@@ -28,7 +28,8 @@ from packuv.footage import (
     without,
 )
 from sync.align import FrameGroups
-from sync.capture import find_capture, find_masks
+from sync.capture import find_capture
+from sync.masks import find_masks
 from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key
 from tasks.stages.synchronize import read_videos, selected

@@ -12,13 +12,16 @@ from packuv.files import save_json
 from packuv.footage import MaskReader
 from packuv.motion import MotionBackend, MotionCache, MotionOptions, measure_motion
 from packuv.motion.foreground import compare_masks
-from sync.capture import check_masks, find_capture, find_masks
+from sync.capture import find_capture
+from sync.masks import check_masks, find_masks
 from tasks.artefacts.stage import Files, Notes, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.stages.footage import Footage, Take
 from tasks.stages.track import MOTION
 
 AGREEMENT = "masks.json"
+UNREAD = "mask folder"
+"""As what a run says which of them it passed over"""
 MOST_OUTSIDE = 0.5
 """Share of what moves that may lie outside the masks: shadows and things that nobody masked move, too"""
 SHIFT_GAIN = 0.05

@@ -144,6 +144,16 @@ def test_the_command_makes_a_capture_of_every_scene(tmp_path, capsys):
     assert main(["adopt", str(tmp_path / "n3dv/coffee"), "--out", str(tmp_path / "other")]) == 0
 
 
+def test_masks_of_none_of_the_cameras_are_named(tmp_path, capsys):
+    colmap(tmp_path / "set")
+    touch(tmp_path / "set/Mask/cam01.mp4", tmp_path / "set/silhouettes/left/000000.png")
+    assert main(["adopt", str(tmp_path / "set"), "--out", str(tmp_path / "out")]) == 0
+    assert [path.name for path in (tmp_path / "out/set/masks").iterdir()] == ["cam01.mp4"]
+    assert "set: silhouettes seems to hold masks, but of none of its cameras" in capsys.readouterr().out.replace(
+        "\n", " "
+    )
+
+
 def test_what_is_in_the_way_stays(tmp_path):
     (tmp_path / "set").mkdir()
     n3dv(tmp_path / "set")

@@ -12,7 +12,8 @@ import pytest
 
 from packuv.footage import MaskReader
 from packuv.footage.png import MARK, png_size
-from sync.capture import check_masks, find_capture, find_masks
+from sync.capture import find_capture
+from sync.masks import check_masks, find_masks
 
 
 def write_masks(folder: Path, masks: list[np.ndarray]) -> Path:

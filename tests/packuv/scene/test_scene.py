@@ -32,7 +32,7 @@ from packuv.scene import (
     verify_scene,
     write_scene,
 )
-from packuv.scene.copy import _END, MAGIC, VOID, read_copy
+from packuv.scene.copy import _END, MAGIC, SEGMENT, VOID, read_copy
 from packuv.scene.header import codes_digest
 from packuv.scene.lookahead import Address
 from packuv.scene.matroska import Packet, write_matroska
@@ -467,10 +467,23 @@ def complaint(path, frames):
 @given(st.data())
 def test_a_file_cut_anywhere_says_so(scene_file, tmp_path, data):
     content = scene_file[0].read_bytes()
-    # What follows the last packet is FFmpeg's seek index and statistics, 1 kB that nothing is lost with, and the copy.
-    most = len(without_copy(content)) - 1024
-    path = damaged(scene_file, tmp_path, content[: data.draw(st.integers(0, most))])
+    copy = len(without_copy(content))
+    places = st.integers(0, len(content) - 1) | st.integers(copy - 1, len(content) - 1)
+    path = damaged(scene_file, tmp_path, content[: data.draw(places)])
     assert str(path) in complaint(path, scene_file[1])
+
+
+def test_a_file_cut_inside_its_second_copy_says_so_and_reads_whole(scene_file, tmp_path):
+    content = scene_file[0].read_bytes()
+    copy = len(without_copy(content))
+    for place in (copy, copy + 1, copy + 9, (copy + len(content)) // 2, len(content) - 64, len(content) - 1):
+        path = damaged(scene_file, tmp_path, content[:place])
+        report = verify_scene(path, threads=1)
+        assert report.header.startswith(f"{path} is cut short: it must have {len(content)} bytes, but has {place}")
+        assert not report.bad
+        assert not complaint(damaged(scene_file, tmp_path, content), scene_file[1])
+    longer = damaged(scene_file, tmp_path, content + b"more")
+    assert "something else follows" in complaint(longer, scene_file[1])
 
 
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -480,8 +493,7 @@ def test_a_flipped_bit_never_gives_wrong_codes(scene_file, tmp_path, data):
     place = data.draw(st.integers(0, len(content) - 1) | st.integers(0, 6000))  # the headers are in the first 6 kB
     content[place] ^= 1 << data.draw(st.integers(0, 7))
     path = damaged(scene_file, tmp_path, bytes(content))
-    message = complaint(path, scene_file[1])
-    assert not message or str(path) in message
+    assert str(path) in complaint(path, scene_file[1])
 
 
 def test_a_damaged_packet_is_named_and_costs_the_rest_of_its_segment(scene_file, tmp_path):
@@ -578,9 +590,15 @@ def copy_of(path):
         return read_copy(file)
 
 
+def resized(content):
+    """With the size of the segment that belongs to so many bytes."""
+    at = content.index(SEGMENT) + len(SEGMENT)
+    return content[:at] + (len(content) - at - 8 | 1 << 56).to_bytes(8) + content[at + 8 :]
+
+
 def without_copy(content):
     """A file as programs that know nothing of the copy write it."""
-    return content[: content.rindex(VOID + b"\0")]
+    return resized(content[: content.rindex(VOID + b"\0")])
 
 
 def test_damage_to_the_header_is_named(scene_file, tmp_path):
@@ -621,9 +639,11 @@ def test_no_damaged_byte_outside_of_packets_costs_anything(scene_file, tmp_path)
             for number, place in enumerate(places):
                 free[place : place + scene.index.tracks[track].sizes[number]] = False
     rng = np.random.default_rng(0)
-    for place in [0, 3, len(content) - 1, *rng.choice(np.flatnonzero(free), 60)]:
+    parts = elements(content, 0, len(content))
+    for place in [0, 3, len(content) - 1, *rng.choice(np.flatnonzero(free), 40), *rng.choice(list(parts), 40)]:
         changed = bytearray(content)
         changed[place] ^= 1 << rng.integers(8)
+        assert complaint(damaged(scene_file, tmp_path, bytes(changed)), frames), f"byte {place} is changed"
         with open_scene(damaged(scene_file, tmp_path, bytes(changed)), threads=1) as scene:
             assert scene.header.times_ns.tolist() == copy_times(copy)
             for frame in (0, 4, 20):
@@ -650,14 +670,18 @@ def test_a_copy_of_another_scene_or_of_moved_packets_tells_nothing(scene_file, t
     path = scene_file[0]
     content = path.read_bytes()
     at = len(without_copy(content))
-    other = content[at:].replace(b"packuv-copy", b"packuv-copx")
-    moved = content[:at] + VOID + (100).to_bytes(7, "big") + bytes(100) + content[at:]
-    for changed in (content[:at], content[:at] + other, moved):
-        assert verify_scene(damaged(scene_file, tmp_path, changed)).ok
+    other = content[at:].replace(b"packuv-copy", b"another-end")
+    for changed in (content[:at], content[:at] + other):
+        assert verify_scene(damaged(scene_file, tmp_path, resized(changed))).ok
+    moved = resized(content[:at] + VOID + (100).to_bytes(7, "big") + bytes(100) + content[at:])
+    report = verify_scene(damaged(scene_file, tmp_path, moved))
+    assert not report.bad
+    assert "bytes around its pictures are not those that were written" in report.header
     packed = zlib.compress(copy_of(path).header.replace(b'"30000/1001"', b'"30000/1002"')), zlib.compress(b"{}")
     append = b"".join(packed)
     end = _END.pack(hashlib.sha256(append).digest(), *map(len, packed), MAGIC)
-    assert verify_scene(damaged(scene_file, tmp_path, content[:at] + append + end)).ok
+    element = VOID + len(append + end).to_bytes(7, "big") + append + end
+    assert verify_scene(damaged(scene_file, tmp_path, resized(content[:at] + element))).ok
 
 
 def rewritten(scene_file, tmp_path, change):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,17 @@ def a_strange_calibration(folder: Path) -> Path:
     return folder
 
 
+def borrowing(lender: Callable[[Path], Path]) -> Callable[[Path], Path]:
+    """A capture whose rig is that of another one."""
+
+    def made(folder: Path) -> Path:
+        lender(folder.with_name("lender"))
+        (still(folder) / "capture.toml").write_text('rig_from = "lender"')
+        return folder
+
+    return made
+
+
 @pytest.mark.parametrize(
     ("capture", "more", "message"),
     [
@@ -149,6 +161,9 @@ def a_strange_calibration(folder: Path) -> Path:
         (a_strange_calibration, [], "transforms.json"),
         (still, ["--clock", "content"], "do not tell when cam1, cam2, cam3 began to film"),
         (cut_short, [], "19 timecodes"),
+        (borrowing(one_without_a_lens), [], "videos without one: cam3"),
+        (borrowing(a_strange_calibration), [], "transforms.json"),
+        (borrowing(cut_short), [], "19 timecodes"),
         (still, ["--frames", "50:60"], "the capture has instants 0 to 19"),
     ],
 )
@@ -162,6 +177,36 @@ def test_a_plan_refuses_what_its_run_refuses(tmp_path, capsys, capture, more, me
             assert not (tmp_path / "out").exists(), "a plan leaves nothing where nothing was"
     assert told[0] == told[1]
     assert message in told[0]
+
+
+def test_a_take_of_another_shape_than_the_one_whose_rig_it_uses_cannot_be_planned(tmp_path, capsys):
+    lender, take = shutil.copytree(CAPTURE, tmp_path / "lender"), tmp_path / "take"
+    (take / "videos").mkdir(parents=True)
+    for video in (lender / "videos").iterdir():
+        write_video(take / "videos" / f"{video.stem}.mkv", None)  # square
+    (take / "capture.toml").write_text('rig_from = "lender"')
+    assert main(["plan", str(take), "--out", str(tmp_path / "out")]) == WRONG
+    assert "must film in the shape it was calibrated in" in capsys.readouterr().err
+
+
+def test_the_rig_of_another_take_is_forecast_until_it_is_there(tmp_path, capsys):
+    def minutes(capture: Path) -> float:
+        words = ["plan", str(capture), "--out", str(out), "--stop-after", "calibrate", *SETS, "--json"]
+        assert main(words) == OK
+        return next(step["minutes"] for step in json.loads(capsys.readouterr().out)["stages"][1:])
+
+    lender, take, out = (tmp_path / name for name in ("lender", "take", "out"))
+    for folder in (lender, take):
+        shutil.copytree(CAPTURE, folder)
+    (out / "take").mkdir(parents=True)  # so that what a look finds is remembered
+    alone = minutes(take)
+    text = (take / "capture.toml").read_text()
+    (take / "capture.toml").write_text(f'{text}\nrig_from = "lender"')
+    before = minutes(take)
+    assert before > alone
+    assert main(["run", str(lender), "--out", str(out), "--direct", "--stop-after", "calibrate", *SETS]) == OK
+    capsys.readouterr()
+    assert minutes(take) == pytest.approx(alone)
 
 
 def test_a_rig_that_is_to_be_solved_is_forecast_and_told(tmp_path, capsys):

@@ -238,6 +238,16 @@ def test_masks_that_come_later_redo_what_they_are_used_for_and_doubtful_ones_not
     assert next(out.glob("*/scene.mkv")).read_bytes() == scene
 
 
+def test_what_only_seems_to_be_masks_is_told_by_plan_and_run(tmp_path, capsys):
+    capture, out = shutil.copytree(CAPTURE, tmp_path / "capture"), tmp_path / "out"
+    (capture / "matte").mkdir()
+    asked, told = [str(capture), "--out", str(out), "--preset", "draft"], "matte/ seems to hold foreground masks and is"
+    assert main(["plan", *asked]) == OK
+    assert told in capsys.readouterr().out
+    assert main(["run", *asked, "--direct", "--stop-after", "sync"]) == OK
+    assert f"look at    {told}" in capsys.readouterr().out
+
+
 def test_masks_that_do_not_fit_end_plan_and_run_before_any_work(tmp_path, capsys):
     capture, out = shutil.copytree(CAPTURE, tmp_path / "capture"), tmp_path / "out"
     asked = [str(capture), "--out", str(out), "--preset", "draft", "--hold-out", "cam03"]

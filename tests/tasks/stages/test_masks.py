@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sync.capture import find_capture, find_masks
+from sync.capture import find_capture
+from sync.masks import find_masks
 from tasks.artefacts.stage import Files, Notes, Site
 from tasks.artefacts.store import Key
 from tasks.report.facts import ReportInput
