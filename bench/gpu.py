@@ -46,7 +46,7 @@ from packuv.fit.model import Model
 from packuv.fit.options import FitOptions, FrameOptions, SolverOptions
 from packuv.fit.pace import FitSize, made_up, step_seconds
 from packuv.fit.shots import find_shots
-from packuv.fit.solver import open_solver
+from packuv.fit.solvers import open_solver
 from packuv.fit.start.bounds import find_bounds
 from packuv.fit.start.first import SH_BASE, round_gaussians
 from packuv.fit.start.points import Points

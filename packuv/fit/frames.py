@@ -19,7 +19,8 @@ from packuv.fit.lift import lift_motion
 from packuv.fit.model import Model
 from packuv.fit.options import FrameOptions
 from packuv.fit.shots import find_shots, moving_rows
-from packuv.fit.solver import open_solver, tiled
+from packuv.fit.solver import tiled
+from packuv.fit.solvers import open_solver
 from packuv.fit.start.first import empty_gaussians
 from packuv.footage import Views
 from packuv.gaussians.codes import OPACITY, Codes

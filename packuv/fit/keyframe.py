@@ -32,7 +32,8 @@ from packuv.fit.density import SUPPORTED_AT
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, KeyframeOptions, NextOptions
 from packuv.fit.shots import Shot, find_shots, halved, moving_rows
-from packuv.fit.solver import Losses, Solver, open_solver, tiled
+from packuv.fit.solver import Losses, Solver, tiled
+from packuv.fit.solvers import open_solver
 from packuv.fit.start.bounds import Bounds, find_bounds
 from packuv.fit.start.first import AIR_OPACITY, first_gaussians, neighbour_distance, round_gaussians
 from packuv.fit.start.hull import hull_points, in_hull

@@ -11,19 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from numba import prange
 
+from packuv.fit.ssim import C1, C2, RADIUS, WINDOW
 from packuv.kernels.compile import kernel, prefer_tbb
 from packuv.kernels.simd import ALL, WIDTH, above, fma, larger, load, select, splat, store, sum_lanes, zeros
 from packuv.raster.view import TILE
 
-RADIUS = 5
 _LENGTH = 2 * RADIUS + 1
 _STRIP = 6
 """Rows of tiles per piece of work. A piece computes 20 more rows than it owns, so short strips waste work; long ones
 leave threads idle and, with few active tiles, cover pixels that nobody asked for."""
 _f32 = np.float32
-_weights = np.exp(-((np.arange(_LENGTH) - RADIUS) ** 2) / (2 * 1.5**2))
-WINDOW = (_weights / _weights.sum()).astype(np.float32)
-C1, C2 = _f32(0.01**2), _f32(0.03**2)
 _0, _1, _2 = _f32(0), _f32(1), _f32(2)
 
 

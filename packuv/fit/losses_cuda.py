@@ -14,7 +14,7 @@ import torch
 from numba import float32
 from torch import Tensor
 
-from packuv.fit.losses import C1, C2, RADIUS, WINDOW
+from packuv.fit.ssim import C1, C2, RADIUS, WINDOW
 from packuv.raster.cuda.launch import MEMORY, THREADS, on_device, run
 from packuv.raster.view import TILE
 

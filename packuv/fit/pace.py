@@ -11,7 +11,8 @@ from packuv.camera import PinholeCamera
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions
 from packuv.fit.shots import Shot
-from packuv.fit.solver import Solver, open_solver
+from packuv.fit.solver import Solver
+from packuv.fit.solvers import open_solver
 from packuv.fit.start.bounds import Bounds
 from packuv.gaussians.floats import Gaussians
 

@@ -15,7 +15,8 @@ from packuv.fit.backdrop import Backdrop, joined
 from packuv.fit.keyframe import DEAD_CODE, KeyState, born_in_hull, figures_of, inside, still_shot, undone
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions, NextOptions
-from packuv.fit.solver import open_solver, tiled
+from packuv.fit.solver import tiled
+from packuv.fit.solvers import open_solver
 from packuv.fit.start.bounds import find_bounds
 from packuv.fit.start.first import StartOptions
 from packuv.fit.start.hull import hull_points

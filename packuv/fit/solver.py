@@ -1,7 +1,7 @@
 """Iterations over the pictures of one instant: render, compare, step, and keep the number of Gaussians in hand.
 
 `Solver` holds the schedule and all choices at random, and iterates on the CPU; `packuv.fit.resident` iterates on a GPU
-by the same schedule. `open_solver` gives the one that the options' device asks for.
+by the same schedule. `packuv.fit.solvers` gives the one that the options' device asks for.
 """
 
 from __future__ import annotations
@@ -49,21 +49,6 @@ def mean_losses(losses: Sequence[Losses]) -> Losses:
     """Mean of each term over the iterations in which it applied."""
     names = dict.fromkeys(name for part in losses for name in part)
     return {name: float(np.mean([part[name] for part in losses if name in part])) for name in names}
-
-
-def open_solver(
-    model: Model,
-    bounds: Bounds,
-    options: SolverOptions,
-    rng: np.random.Generator,
-    backdrop: Backdrop | None = None,
-) -> Solver:
-    """A solver on the options' device, with the arguments of `Solver`."""
-    if options.device == "cpu":
-        return Solver(model, bounds, options, rng, backdrop)
-    from packuv.fit.resident import ResidentSolver  # late, for it needs torch
-
-    return ResidentSolver(model, bounds, options, rng, backdrop)
 
 
 class Solver:

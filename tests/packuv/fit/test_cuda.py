@@ -15,7 +15,7 @@ from packuv.fit.losses import PhotometricOptions, photometric_loss
 from packuv.fit.model import Model
 from packuv.fit.options import FitOptions
 from packuv.fit.shots import Shot
-from packuv.fit.solver import open_solver
+from packuv.fit.solvers import open_solver
 from packuv.fit.start.bounds import Bounds
 from packuv.raster import render
 from tests.support.dense_raster import OPTIONS, camera, scene

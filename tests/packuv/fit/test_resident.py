@@ -22,7 +22,8 @@ from packuv.fit.options import FitOptions
 from packuv.fit.resident import ResidentSolver
 from packuv.fit.shots import Shot
 from packuv.fit.shots_cuda import ShotOnGpu
-from packuv.fit.solver import Solver, open_solver
+from packuv.fit.solver import Solver
+from packuv.fit.solvers import open_solver
 from packuv.fit.start.bounds import Bounds
 from packuv.footage import Response
 from packuv.gaussians.codes import Codes
