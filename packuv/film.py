@@ -15,6 +15,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.container import OutputContainer
 
 from packuv.bounds import field, fields, finite, items, whole
 from packuv.camera import PinholeCamera
@@ -29,6 +30,10 @@ MOST_VIEWS, MOST_SECONDS = 1000, 3600.0
 CODING = {"crf": "16", "preset": "medium", "x264-params": "threads=1:sliced-threads=0:cpu-independent=1"}
 """Of x264; one thread, for its output depends on their number, and no choice of code by the processor, for its
 macroblock tree for AVX-512 reads memory that nobody wrote"""
+SOUND_RATE = 48_000
+"""Samples a second of a film's sound"""
+PACE = 0.02
+"""Share by which frames may pass faster or slower than they were filmed, for their sound to be heard; and one frame"""
 
 
 @dataclass(frozen=True)
@@ -152,11 +157,14 @@ def film(
     rate: Fraction | None = None,
     size: tuple[int, int] | None = None,
     device: str = "cpu",
+    sound: np.ndarray | None = None,
 ) -> int:
     """Write an MP4 (H.264, 4:2:0) of the scene along a path, in the light of its frames; returns its pictures.
 
     `rate` is the film's, by default the scene's; `size` the width and height, by default those of the first view, made
-    even. The file is whole or not there. Raises ValueError for a path that names frames which the scene lacks.
+    even. `sound`, float32 [2, n] at SOUND_RATE, is what was heard from the earliest frame on that the path shows; it
+    goes along as AAC, see `sound_along`. The file is whole or not there. Raises ValueError for a path that names frames
+    which the scene lacks.
     """
     rate = rate or scene.header.rate
     first = path.views[0].camera
@@ -169,12 +177,42 @@ def film(
     with whole_file(output) as part, av.open(str(part), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=rate, options=CODING)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        if sound is not None:
+            times = scene.header.times_ns / 1e9
+            _add_sound(container, sound_along(path, sound, times, count / rate))
         moments = [path.at(float(number / rate)) for number in range(count)]
         for done, picture in enumerate(_pictures(scene, moments, (width, height), device), start=1):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
             progress(done, count)
         container.mux(stream.encode(None))
     return count
+
+
+def sound_along(path: CameraPath, sound: np.ndarray, times: np.ndarray, seconds: Fraction) -> np.ndarray:
+    """What is heard along a path for so long, float32 [2, n] at SOUND_RATE: `sound`, which begins at the earliest frame
+    of the path, where frames pass as fast as they were filmed, and silence where they stand, race or go back.
+
+    `times` are those of the scene's frames, seconds.
+    """
+    heard = np.zeros((2, int(seconds * SOUND_RATE)), np.float32)
+    origin = times[min(view.frame for view in path.views)]
+    for before, after in pairwise(path.views):
+        span, filmed = after.seconds - before.seconds, times[after.frame] - times[before.frame]
+        slack = max(PACE * span, float(np.diff(times).max(initial=0)))
+        if filmed <= 0 or abs(filmed - span) > slack:
+            continue
+        start, source = (round(at * SOUND_RATE) for at in (before.seconds, times[before.frame] - origin))
+        part = sound[:, source : source + round(span * SOUND_RATE)][:, : heard.shape[1] - start]
+        heard[:, start : start + part.shape[1]] = part
+    return heard
+
+
+def _add_sound(container: OutputContainer, heard: np.ndarray) -> None:
+    voice = container.add_stream("aac", rate=SOUND_RATE, layout="stereo")
+    frame = av.AudioFrame.from_ndarray(np.ascontiguousarray(heard), format="fltp", layout="stereo")
+    frame.sample_rate, frame.pts = SOUND_RATE, 0
+    for packet in (*voice.encode(frame), *voice.encode(None)):
+        container.mux(packet)
 
 
 def _pictures(

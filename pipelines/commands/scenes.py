@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from packuv.camera import PinholeCamera
+    from packuv.film import CameraPath
     from packuv.footage import Views
     from packuv.scene import SceneHeader
     from packuv.scene.verify import VerifyReport
@@ -216,9 +217,44 @@ def film(arguments: argparse.Namespace) -> int:
         raise ValueError(f"the film becomes an MP4, so its name must end with .mp4, but is {arguments.output.name}")
     path, device = CameraPath.load(arguments.path), choose_device(arguments.device)
     with open_scene(arguments.scene) as scene, shown(arguments, "film") as progress:
-        count = shoot(scene, path, arguments.output, progress, rate=arguments.fps, size=arguments.size, device=device)
-    print(f"{arguments.output}: {count} pictures, {path.seconds:g} s, {len(path.views)} views")
+        camera, sound = _sound_of(scene.header, arguments, path)
+        count = shoot(
+            scene, path, arguments.output, progress, rate=arguments.fps, size=arguments.size, device=device, sound=sound
+        )
+    heard = f", sound of {camera}" if camera else ""
+    print(f"{arguments.output}: {count} pictures, {path.seconds:g} s, {len(path.views)} views{heard}")
     return 0
+
+
+def _sound_of(header: SceneHeader, arguments: argparse.Namespace, path: CameraPath) -> tuple[str, np.ndarray | None]:
+    """The camera that heard what a film shows, and its sound; a note where the run's own capture has changed."""
+    if arguments.capture:
+        return _heard(header, arguments.capture, path)
+    capture = _capture_of(arguments.scene.parent)
+    try:
+        return _heard(header, capture, path) if capture else ("", None)
+    except (OSError, ValueError) as error:
+        print(f"packuv: the film has no sound: {error}", file=sys.stderr)
+        return "", None
+
+
+def _heard(header: SceneHeader, capture: Path, path: CameraPath) -> tuple[str, np.ndarray | None]:
+    """What the reference camera, or else another one of the capture, heard from the earliest frame on that a path
+    shows, and its name; no name where none heard anything."""
+    from packuv.film import SOUND_RATE
+    from sync.capture import find_capture
+    from sync.content.sound import listen
+    from tasks.stages.evaluate import filmed_views, known_cameras
+
+    names, videos = known_cameras(header), find_capture(capture).videos
+    frames = filmed_views(header, capture, names).frames  # [T, C], -1 where a camera has none
+    first, last = (end(min(view.frame, len(frames) - 1) for view in path.views) for end in (min, max))
+    seconds = float(header.times_ns[last] - header.times_ns[first]) / 1e9 + float(1 / header.rate)
+    for camera in sorted(names, key=lambda name: name != header.sync.get("reference")):
+        frame = int(frames[first, names.index(camera)])
+        if frame >= 0 and (sound := listen(videos[camera], frame, seconds, SOUND_RATE)) is not None:
+            return camera, sound
+    return "", None
 
 
 def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:

@@ -65,6 +65,37 @@ def hear(video: Path) -> Sound | None:
     return heard
 
 
+def listen(video: Path, frame: int, seconds: float, rate: int) -> np.ndarray | None:
+    """What a video holds to hear from one of its frames on, float32 [2, n] at `rate`, silent where it has a gap.
+
+    Of the first sound track with anything but timecode on it, the first two channels that are none; one alone is heard
+    on both sides. None where there is no such track.
+    """
+    for track in sound_tracks(video):
+        labels, heard, found = label_channels(track), np.zeros((2, round(seconds * rate)), np.float32), False
+        start = _shown_at(video, frame)
+        for begins, samples in track.blocks(BLOCK_S, rate):
+            voices = [wave for channel, wave in enumerate(samples) if channel not in labels][:2]
+            at = round((begins - start) * rate)
+            if at >= heard.shape[1]:
+                break
+            for side in range(2 if voices else 0):
+                part = voices[side % len(voices)][max(0, -at) :][: heard.shape[1] - max(at, 0)]
+                heard[side, max(at, 0) : max(at, 0) + len(part)] = part
+            found = found or bool(voices)
+        if found:
+            return heard
+    return None
+
+
+def _shown_at(video: Path, frame: int) -> float:
+    """When a frame of a video is shown, the container's seconds."""
+    with av.open(str(video)) as container:
+        picture = container.streams.video[0]
+        shown = sorted(packet.pts for packet in container.demux(picture) if packet.pts is not None)
+        return float(shown[frame] * (picture.time_base or 0))
+
+
 def _room(track: Track) -> tuple[float, np.ndarray]:
     """When a track begins, seconds, and its sound, float32 [n] at `RATE`; silence where it has a gap."""
     labels = label_channels(track)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
-from packuv.film import CameraPath, PathView, film, fitted
+from packuv.film import SOUND_RATE, CameraPath, PathView, film, fitted, sound_along
 from packuv.metrics import psnr
 from packuv.progress import no_progress
 from packuv.scene import open_scene
@@ -109,6 +109,36 @@ def test_a_film_shows_the_scene_from_the_path_in_its_light(tmp_path):
         with pytest.raises(ValueError, match="even width and height"):
             film(scene, path, tmp_path / "c.mp4", no_progress, size=(33, 20))
     assert not (tmp_path / "c.mp4").exists()
+
+
+def test_sound_is_heard_where_frames_pass_as_they_were_filmed(tmp_path):
+    """Still for a second, at the pace of the scene for two, racing, back again: of 40 frames at 10 a second."""
+    rng = np.random.default_rng(0)
+    sound = rng.uniform(-0.5, 0.5, (2, 4 * SOUND_RATE)).astype(np.float32)
+    path = CameraPath((view(0, 5), view(1, 5), view(3, 25), view(3.5, 38), view(4, 20)))
+    heard = sound_along(path, sound, np.arange(40) / 10, Fraction(4))
+    assert heard.shape == (2, 4 * SOUND_RATE)
+    assert np.array_equal(heard[:, SOUND_RATE : 3 * SOUND_RATE], sound[:, : 2 * SOUND_RATE])
+    assert not heard[:, :SOUND_RATE].any()
+    assert not heard[:, 3 * SOUND_RATE :].any()
+
+
+def test_a_film_has_the_sound_that_goes_along(tmp_path):
+    times = np.arange(3 * SOUND_RATE) / SOUND_RATE
+    sound = np.stack([np.sin(2 * np.pi * tone * times) for tone in (440, 660)]).astype(np.float32) / 2
+    path = CameraPath((view(0, 0), view(0.2, 2)))
+    with open_scene(write_wall(tmp_path / "a.mkv", LIGHT)) as scene:
+        path = CameraPath((view(0, 0), view(float(scene.header.times_ns[2]) / 1e9, 2)))
+        count = film(scene, path, tmp_path / "a.mp4", no_progress, rate=Fraction(30), sound=sound)
+        film(scene, path, tmp_path / "b.mp4", no_progress, rate=Fraction(30), sound=sound)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        voice = np.concatenate([frame.to_ndarray() for frame in container.decode(audio=0)], axis=1)
+    assert abs(voice.shape[1] - count / 30 * SOUND_RATE) <= 2048  # whole frames of AAC
+    for side, tone in enumerate((440, 660)):
+        part = voice[side, : SOUND_RATE // 20]
+        spectrum = np.abs(np.fft.rfft(part * np.hanning(len(part))))
+        assert abs(spectrum.argmax() * SOUND_RATE / len(part) - tone) <= 20
 
 
 def lit_by_hand(drawn, light):

@@ -9,7 +9,7 @@ import pytest
 
 from sync.audio import sound_tracks
 from sync.content import sound as module
-from sync.content.sound import RATE, Sound, hear, loudness, starts_by_sound
+from sync.content.sound import RATE, Sound, hear, listen, loudness, starts_by_sound
 from sync.timecode import frame_to_label
 from tests.support.ltc import wave
 from tests.support.sounds import SECONDS, recorded, room, write_video
@@ -114,3 +114,18 @@ def test_sound_after_damage_stays_where_it_was(tmp_path):
     start = round(parts[1][0] * RATE)
     assert np.array_equal(parts[1][1][0], np.concatenate([piece[0] for _, piece in pieces])[start:])
     assert len(whole.level) == pytest.approx(6000, abs=20)
+
+
+def test_listening_begins_at_a_frame_and_is_heard_on_both_sides(tmp_path):
+    rng = np.random.default_rng(0)
+    sides = rng.uniform(-0.5, 0.5, (2, 2 * RATE)).astype(np.float32)
+    write_video(tmp_path / "stereo.mkv", sides)
+    heard = listen(tmp_path / "stereo.mkv", 5, 1.0, RATE)  # of 10 frames a second
+    assert np.allclose(heard, sides[:, RATE // 2 : 3 * RATE // 2], atol=1e-6)
+    beyond = listen(tmp_path / "stereo.mkv", 15, 1.0, RATE)
+    assert np.allclose(beyond[:, : RATE // 2], sides[:, 3 * RATE // 2 :], atol=1e-6)
+    assert not beyond[:, RATE // 2 :].any()
+    write_video(tmp_path / "mono.mkv", sides[0])
+    assert np.allclose(listen(tmp_path / "mono.mkv", 0, 2.0, RATE), sides[[0, 0]], atol=1e-6)
+    write_video(tmp_path / "silent.mkv")
+    assert listen(tmp_path / "silent.mkv", 0, 1.0, RATE) is None
