@@ -24,6 +24,7 @@ BENCHMARKS = (
     "masks",
     "mishaps",
     "motion",
+    "page",
     "pareto",
     "raster",
     "scaling",

@@ -176,7 +176,8 @@ function stall() {
 }
 
 function mayResume() {
-  if (performance.now() - player.stalledAt > STALL_NOTICE_MS && at("wait").hidden) notice("Loading frames…");
+  const long = performance.now() - player.stalledAt > STALL_NOTICE_MS;
+  if (long && at("wait").hidden && !buffer.closed) notice("Loading frames…"); // who closed the trouble knows
   const enough = buffer.trouble ? 1 : Math.min(buffer.ahead - 1, Math.ceil(RESUME_SECONDS * rate * player.speed));
   let next = player;
   for (let left = enough; left > 0; left--) {

@@ -18,14 +18,23 @@ class SlowNetwork:
         self._door = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._door.getsockname()[1]
         self.received = 0
+        self._ends: list[socket.socket] = []
+        self._carriers: list[threading.Thread] = []
 
     def serve(self) -> None:
         with contextlib.suppress(OSError):  # the door is closed
             while True:
                 caller = self._door.accept()[0]
-                server = socket.create_connection(("127.0.0.1", self._target))
-                for pair, pace in (((caller, server), False), ((server, caller), True)):
-                    threading.Thread(target=self._hand_on, args=(*pair, pace), daemon=True).start()
+                self._carriers.append(threading.Thread(target=self._carry, args=(caller,)))
+                self._carriers[-1].start()
+
+    def _carry(self, caller: socket.socket) -> None:
+        with caller, socket.create_connection(("127.0.0.1", self._target)) as server:
+            self._ends += [caller, server]
+            asking = threading.Thread(target=self._hand_on, args=(caller, server, False))
+            asking.start()
+            self._hand_on(server, caller, True)
+            asking.join()
 
     def _hand_on(self, source: socket.socket, target: socket.socket, paced: bool) -> None:
         with contextlib.suppress(OSError):
@@ -33,9 +42,7 @@ class SlowNetwork:
                 if paced:
                     self._wait(len(data))
                 target.sendall(data)
-        for end in (source, target):
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
+        _hang_up([source, target])
 
     def _wait(self, size: int) -> None:
         with self._turn:
@@ -45,7 +52,17 @@ class SlowNetwork:
         time.sleep(max(0.0, until - time.monotonic()))
 
     def close(self) -> None:
+        _hang_up([self._door])
         self._door.close()
+        _hang_up(self._ends)
+        for carrier in self._carriers:
+            carrier.join()
+
+
+def _hang_up(ends: list[socket.socket]) -> None:
+    for end in ends:
+        with contextlib.suppress(OSError):  # the other side was quicker
+            end.shutdown(socket.SHUT_RDWR)
 
 
 @contextlib.contextmanager
@@ -57,3 +74,4 @@ def slow_network(port: int, bits_per_second: float) -> Iterator[SlowNetwork]:
         yield network
     finally:
         network.close()
+        thread.join()
