@@ -18,7 +18,7 @@ from calibration.confirm import confirm
 from calibration.features import Features
 from calibration.refine import tracks
 from calibration.rig import Camera, Rig
-from calibration.triangulate import TriangulateOptions, matches_along, on_one_geometry
+from calibration.triangulate import TriangulateOptions, choose_pairs, matches_along, on_one_geometry
 
 FOCAL_SCALES = (0.8, 0.85, 0.91, 0.95, 1.05, 1.1, 1.18, 1.25)
 BENDS = (-0.3, -0.15, -0.07, -0.03, 0.03, 0.07, 0.15, 0.3)
@@ -88,7 +88,7 @@ def doubts(
     evidence = _of_one_geometry(rig, evidence)
     errors = _errors_px(rig, evidence)
     limit = options.limit_px(int(np.median([camera.width for camera in rig.cameras])))
-    three = _by_three(rig, evidence, features, judge, limit)
+    three = _by_three(rig, rig.names, evidence, features, judge, limit)
     cleared = _cleared(rig, errors, options)
     known = _confirming_px(errors, judge.judge, options) | _medians_px(errors, options.accusing_matches)
     exact = {name for key, px in known.items() if px <= options.exact * limit for name in key}
@@ -113,7 +113,7 @@ def doubts(
         )
     if WHOLE in found:  # where all are wrong, nothing tells of one
         return found
-    return found | (_by_three(kept, right, features, judge, limit) if off else three)
+    return found | (_by_three(rig, kept.names, right, features, judge, limit) if off else three)
 
 
 UNCONFIRMED = "is not confirmed"
@@ -134,26 +134,29 @@ Errors = Mapping[frozenset[str], np.ndarray]
 
 def _by_three(
     rig: Rig,
+    names: Sequence[str],
     evidence: Sequence[PairMatches],
     features: Sequence[Mapping[str, Features]],
     judge: TriangulateOptions,
     limit_px: float,
 ) -> dict[str, str]:
-    """What three cameras at a time say, who see what no two of them do, of each that they do not confirm."""
+    """What three of these cameras at a time say, who see what no two of them do, of each that they do not confirm."""
     telling = [pair for pair in evidence if len(pair.first_pixels) >= judge.judge.min_matches]
     # A wrong camera spoils many pairs of a small rig; what the better ones say, a pixel's noise is for all.
     best = np.percentile([np.median(pair_errors_px(rig, pair)) for pair in telling] or [limit_px], 25)
     noise_px = float(np.clip(1.48 * best, limit_px / 4, limit_px))
-    wrong, unsure = confirm(rig, tracks(rig, evidence), noise_px=noise_px)
+    part = rig.select(names)
+    wrong, unsure = confirm(part, tracks(part, evidence), noise_px=noise_px)
     asked = {*wrong, *unsure}
     if asked and features:
-        pairs = [(pair.first, pair.second) for pair in evidence if asked & {pair.first, pair.second}]
+        near = choose_pairs(rig, neighbours=judge.neighbours)
+        pairs = [pair for pair in near if asked & set(pair) and set(pair) <= set(names)]
         along = [
             match
             for found in features
             for match in matches_along(rig, found, [p for p in pairs if set(p) <= found.keys()], options=judge)
         ]
-        wrong, unsure = confirm(rig, tracks(rig, [*evidence, *along]), noise_px=noise_px)
+        wrong, unsure = confirm(part, tracks(part, [*evidence, *along]), noise_px=noise_px)
     return wrong | {name: f"{UNCONFIRMED}: {why}" for name, why in unsure.items()}
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from calibration.accept import MatchOptions, PairMatches, Verdict, matches_report
 from calibration.doubt import WHOLE, accused, doubts
+from calibration.features import Features
 from calibration.judge import judge
 from calibration.rig import Camera, Rig
 from calibration.triangulate import TriangulateOptions, choose_pairs, detect_all, verified_matches
@@ -27,15 +28,20 @@ def right() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def evidence(right) -> list[PairMatches]:
-    """Matches found without the poses, and so the same for any: but for the lenses, which RANSAC takes out."""
+def features(right) -> dict[str, Features]:
     pictures = {camera.name: render(camera, oversample=1) for camera in right.cameras}
-    features = detect_all(right, pictures, options=OPTIONS.features)
+    return detect_all(right, pictures, options=OPTIONS.features)
+
+
+@pytest.fixture(scope="module")
+def evidence(right, features) -> list[PairMatches]:
+    """Matches found without the poses, and so the same for any: but for the lenses, which RANSAC takes out."""
     return verified_matches(right, features, choose_pairs(right, neighbours=8), ratio=OPTIONS.ratio)
 
 
-def found(rig: Rig, evidence: list[PairMatches]) -> dict[str, str]:
-    return doubts(rig, evidence, matches_report(rig, evidence, options=OPTIONS.judge), judge=OPTIONS)
+def found(rig: Rig, evidence: list[PairMatches], *features: dict[str, Features]) -> dict[str, str]:
+    report = matches_report(rig, evidence, options=OPTIONS.judge)
+    return doubts(rig, evidence, report, judge=OPTIONS, features=features)
 
 
 def one(change: Callable[[Camera], Camera]) -> Callable[[Rig], Rig]:
@@ -124,6 +130,19 @@ def test_a_dozen_chance_matches_at_each_instant_accuse_nobody(right, evidence):
     assert accused(said) == set()
     change, named = FAULTS["focal length"]
     assert set(found(change(right), [*evidence, *chance * 3])) == {named}
+
+
+def test_matches_along_the_lines_tell_where_few_are_found_without_the_poses(right, evidence, features):
+    few = [
+        replace(pair, first_pixels=pair.first_pixels[:most], second_pixels=pair.second_pixels[:most])
+        for pair in evidence
+        for most in [1 if WRONG in (pair.first, pair.second) else None]
+    ]
+    said = found(right, few)
+    assert (set(said), accused(said)) == ({WRONG}, set())
+    assert found(right, few, features) == {}
+    change, named = FAULTS["principal point"]
+    assert set(found(change(right), few, features)) == {named}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

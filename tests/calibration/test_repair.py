@@ -11,9 +11,9 @@ from calibration.accept import PairMatches
 from calibration.doubt import WHOLE
 from calibration.repair import repair
 from calibration.rig import Camera, Rig
-from tests.calibration.test_doubt import FAULTS, OTHER, WRONG, evidence, found, right
+from tests.calibration.test_doubt import FAULTS, OTHER, WRONG, evidence, features, found, right
 
-__all__ = ["evidence", "right"]  # fixtures
+__all__ = ["evidence", "features", "right"]  # fixtures
 
 
 def errors(rig: Rig, truth: Rig) -> tuple[float, float, float]:
