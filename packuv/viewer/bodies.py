@@ -11,6 +11,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,6 +116,11 @@ class Bodies:
     def part(self, segment: int, number: int) -> bytes:
         """A part of a key; raises IndexError where there is none."""
         return self._once(("part", segment, number), lambda: self._part(segment, number))
+
+    def get_ready(self) -> None:
+        """Make what the page asks for first; what is wrong with it hears who asks."""
+        with suppress(ValueError, OSError):
+            self.part(0, 0)
 
     def frame(self, frame: int) -> bytes:
         """The moving rows of a frame, less what its parents foretell; raises IndexError for a key, which has parts."""

@@ -85,8 +85,11 @@ def answer_until_interrupted(
     announce(server.url) if announce else print(server.url, flush=True)
     if open_browser:
         webbrowser.open(server.url)
+    getting_ready = threading.Thread(target=server.bodies.get_ready)
+    getting_ready.start()  # while the browser does
     with suppress(KeyboardInterrupt):
         server.serve_forever()
+    getting_ready.join()  # it reads the scene file
 
 
 Grown = Callable[[], tuple[Source, Truth | None] | None]

@@ -126,15 +126,16 @@ function parentsOf(frame) {
   return [first + low, first + high];
 }
 
-// What is coming up, each frame after those from which it is predicted.
+// What is coming up, each frame after those from which it is predicted; if what is to be shown now has not arrived, no
+// more than that.
 function needed() {
-  const list = new Set();
+  const list = new Set(), { frame: now } = playhead;
   const add = (frame) => {
     if (list.has(frame)) return;
     if (!frames.has(frame)) parentsOf(frame).forEach(add);
     list.add(frame);
   };
-  upcoming().forEach(add);
+  (frames.has(now) || lost.has(now) ? upcoming() : [now]).forEach(add);
   return list;
 }
 
@@ -146,7 +147,7 @@ function prefetch() {
     control.abort();
     fetching.delete(frame);
   }
-  forgetKeys();
+  forgetKeys(wanted);
   if (performance.now() < resumeAt) return;
   for (const frame of wanted) {
     if (fetching.size >= FETCHES) break;
@@ -243,7 +244,7 @@ function begin(entry, segment) {
   });
 }
 
-function forgetKeys() {
+function forgetKeys(wanted) {
   const needed = new Set();
   const need = (segment) => {
     if (needed.has(segment)) return;
@@ -251,7 +252,8 @@ function forgetKeys() {
     const reference = keys.get(segment)?.key?.reference ?? null;
     if (reference !== null) need(reference);
   };
-  [...upcoming().map((frame) => owners[frame]), sent.segment].forEach(need);
+  for (const frame of wanted) need(owners[frame]);
+  need(sent.segment);
   for (const [old, entry] of [...keys]) {
     if (needed.has(old)) continue;
     if (!entry.key?.base && entry.whole) { entry.control.abort(); entry.whole = null; } // its parts stay

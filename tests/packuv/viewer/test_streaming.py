@@ -13,6 +13,7 @@ import pytest
 
 from packuv.gaussians.codes import Codes
 from packuv.viewer.bodies import parents
+from packuv.viewer.server import Content
 from packuv.viewer.source import SegmentSource
 from tests.support.browser import Browser, running_browser
 from tests.support.network import slow_network
@@ -87,6 +88,32 @@ def test_bands_of_view_dependence_come_last_and_the_picture_is_then_the_very_sam
                 time.sleep(0.5)
                 pictures.append(browser.picture())
     assert np.array_equal(*pictures)
+
+
+@pytest.mark.slow
+def test_who_seeks_does_not_wait_for_what_was_on_its_way(browser: Browser) -> None:
+    """Up to three frames of 33 kB each are on their way when a key of 96 kB is wanted."""
+    rng = np.random.default_rng(8)
+    parts = tuple(make_segment(rng, 8 * k, length=8, count=6000, dynamic=0.35, columns=10) for k in range(6))
+    source, asked = SegmentSource(parts, make_quantizer(), Fraction(6), make_ring()), []
+    with running(source) as server, slow_network(server.server_address[1], 1e6) as network:
+        content = server.content
+
+        def note(path: str) -> Content | None:
+            asked.append((path, network.received))
+            return content(path)
+
+        server.content = note  # type: ignore[method-assign]
+        browser.open(f"http://127.0.0.1:{network.port}/#camera=cam1&play=0&bare=1", 96, 72)
+        browser.wait_for(f"{PAGE}.frame == 0")
+        browser.evaluate("dispatchEvent(new KeyboardEvent('keydown', { key: 'End' }))")
+        browser.wait_for(f"{PAGE}.frame == 47")
+        assert browser.evaluate(f"{PAGE}.lost") is None
+        assert browser.evaluate("document.getElementById('wait').hidden")
+    paths, received = zip(*asked, strict=True)
+    key, frame = paths.index("/segments/5/0.bin"), paths.index("/frames/47.bin")
+    assert paths[key : frame + 1] == ("/segments/5/0.bin", "/segments/5/1.bin", "/frames/47.bin")
+    assert 90_000 < received[frame] - received[key] < 200_000
 
 
 @pytest.mark.slow
