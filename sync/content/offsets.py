@@ -14,10 +14,15 @@ from sync.content.hull import compare_with_hull
 
 APART = 2 / 3
 """Offset in instants from which a camera is said to be off: a whole frame, less what is measured too little"""
-SIGNIFICANCE = 2.0
-"""Standard errors by which an offset must differ from what the times say"""
-DECIDED = 0.4
-"""Standard error, in instants, up to which a camera's times are taken to be looked at"""
+SIGNIFICANCE = 3.0
+"""Standard errors by which an offset must differ from what the times say: tens of cameras are looked at at once"""
+DECIDED = 1 / SIGNIFICANCE
+"""Standard error, in instants, up to which a camera's times are taken to be looked at: a whole frame would be named"""
+MILDEST, MILDEST_MEAN = 0.8, 0.44
+"""Share of the cameras, those nearest to 0, whose offsets tell how right their errors are, and the mean square that
+these have in standard errors if they are"""
+MOST_SCATTER = 2.0
+"""Factor by which errors are enlarged at most: cameras that run freely scatter by parts of an instant"""
 CLEAR = 1.75
 """Standard errors by which pictures must agree better at an offset than two instants beside, or it is chance"""
 LEAST_ERROR = 0.02
@@ -55,7 +60,7 @@ class Offset:
     instants: float
     """At instant t the camera shows what the others show at t + `instants`: its times are too small by so much"""
     error: float
-    """Standard error, from instants and from cameras left out in turn"""
+    """Standard error, from instants and from cameras left out in turn, and how much the cameras scatter"""
     expected: float = 0.0
     """What its times say, by their residuals"""
     clear: float = np.inf
@@ -155,12 +160,26 @@ def find_offsets(
     usual = _usual([own.instants + places[camera] for camera, own in found.items()])
     said = [(expected or {}).get(name, 0.0) for name in names]
     told = _told(found, places - usual, said)
+    scatter = _scatter(told)
+    told = _less_sure(told, scatter)
     sure = [camera for camera, own in told.items() if own.decided]
     if len(sure) < len(told) and any(own.lies for own in told.values()):
         again = _measure([cameras[camera] for camera in sure], places[sure], reach)
-        still = _told({sure[row]: own for row, own in again.items()}, places - usual, said)
+        still = _less_sure(_told({sure[row]: own for row, own in again.items()}, places - usual, said), scatter)
         told |= {camera: _doubted(own) for camera, own in told.items() if own.lies and not _lies_in(still, camera)}
     return {names[camera]: own for camera, own in told.items()}
+
+
+def _scatter(told: Mapping[int, Offset]) -> float:
+    """By what factor cameras that do not lie scatter more than their errors say: few instants and partners that see
+    the same things move tell too little of how sure an offset is."""
+    squares = sorted((own.away / own.error) ** 2 for own in told.values() if not own.lies)
+    mildest = squares[: int(np.ceil(MILDEST * len(squares)))]
+    return float(np.clip(np.sqrt(np.mean(mildest) / MILDEST_MEAN), 1.0, MOST_SCATTER)) if mildest else 1.0
+
+
+def _less_sure(told: Mapping[int, Offset], factor: float) -> dict[int, Offset]:
+    return {camera: replace(own, error=own.error * factor) for camera, own in told.items()}
 
 
 def _lies_in(found: Mapping[int, Offset], camera: int) -> bool:

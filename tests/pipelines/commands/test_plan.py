@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pipelines import space
+from pipelines.ahead import look_ahead
 from pipelines.cli import FAILED, OK, WRONG, main
+from pipelines.forecast import Guess, Machine, forecast
+from pipelines.options import SequenceOptions
 from pipelines.probe import PROBE
+from pipelines.request import RunRequest
 from tests.pipelines.commands.test_run import CAPTURE, _flat
 from tests.support.golden import SETTINGS
 from tests.support.sounds import write_video
@@ -190,23 +195,22 @@ def test_a_take_of_another_shape_than_the_one_whose_rig_it_uses_cannot_be_planne
 
 
 def test_the_rig_of_another_take_is_forecast_until_it_is_there(tmp_path, capsys):
-    def minutes(capture: Path) -> float:
-        words = ["plan", str(capture), "--out", str(out), "--stop-after", "calibrate", *SETS, "--json"]
-        assert main(words) == OK
-        return next(step["minutes"] for step in json.loads(capsys.readouterr().out)["stages"][1:])
-
     lender, take, out = (tmp_path / name for name in ("lender", "take", "out"))
     for folder in (lender, take):
         shutil.copytree(CAPTURE, folder)
-    (out / "take").mkdir(parents=True)  # so that what a look finds is remembered
-    alone = minutes(take)
     text = (take / "capture.toml").read_text()
+    (lender / "capture.toml").write_text(text.replace('"tiny"', '"lender"'))
     (take / "capture.toml").write_text(f'{text}\nrig_from = "lender"')
-    before = minutes(take)
-    assert before > alone
-    assert main(["run", str(lender), "--out", str(out), "--direct", "--stop-after", "calibrate", *SETS]) == OK
-    capsys.readouterr()
-    assert minutes(take) == pytest.approx(alone)
+    asked = RunRequest(str(take), str(out), stop_after="calibrate")
+    size = look_ahead(asked).size
+    assert size.lender is not None
+    assert len(size.lender.fitted) == len(size.fitted) + len(size.held_out)
+    assert not size.lender.solved
+    (with_it, without), options = (size, replace(size, lender=None)), SequenceOptions()
+    seconds = [forecast(one, options, Machine(Guess())).seconds["calibrate"] for one in (with_it, without)]
+    assert seconds[0] > seconds[1]
+    assert main(["run", str(lender), "--out", str(out), "--direct", "--stop-after", "calibrate"]) == OK
+    assert look_ahead(asked).size == without
 
 
 def test_a_rig_that_is_to_be_solved_is_forecast_and_told(tmp_path, capsys):
