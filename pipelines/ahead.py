@@ -36,15 +36,16 @@ from pipelines.space import check_room, missing_bytes, size_found
 from pipelines.stages import Made
 from pipelines.stages import Sequence as Stages
 from sync.capture import Capture, find_lender
-from sync.masks import find_masks, masks_unread
+from sync.masks import find_masks
+from sync.nearby import unread
 from tasks.artefacts.digests import Signature
 from tasks.artefacts.originals import Originals
 from tasks.artefacts.store import Store
 from tasks.artefacts.workshop import Workshop
 from tasks.stages.calibrate import check_given, check_lent
-from tasks.stages.masks import UNREAD
 from tasks.stages.plan import Plan
 from tasks.stages.scale import known_of
+from tasks.stages.synchronize import UNREAD
 
 LAST_OF = {
     "sync": "sync",
@@ -220,7 +221,7 @@ def _fitted_frames(made: Made, store: Store) -> int:
 def _spared(capture: Capture, plan: Plan, options: SequenceOptions, size: Size) -> Iterator[tuple[str, str]]:
     """Work that the capture or the settings spare."""
     fit = options.fit
-    yield from ((UNREAD, note) for note in masks_unread(capture))
+    yield from ((UNREAD, note) for note in unread(capture))
     if capture.settings.rig_from:
         if not (size.lender and size.lender.solved):
             yield "solving the cameras", f"their rig is that of {capture.settings.rig_from}"

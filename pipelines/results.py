@@ -63,9 +63,9 @@ from tasks.stages.evaluate import METRICS, PICTURES, TABLE, fitted_scores, frame
 from tasks.stages.fitting import REFUSED
 from tasks.stages.footage import LIGHT, RIG
 from tasks.stages.light import read_damage, read_steady
-from tasks.stages.masks import UNREAD, doubts
+from tasks.stages.masks import doubts
 from tasks.stages.plan import Plan
-from tasks.stages.synchronize import FOOTAGE, read_videos
+from tasks.stages.synchronize import FOOTAGE, UNREAD, read_videos
 from tasks.stages.track import read_curve, read_keyframes
 
 WHOLE = (SCENE, PAGE_NAME, JSON_NAME, "run.json")
@@ -308,7 +308,7 @@ def collect(run: Remains) -> ReportInput:
         evidence=_evidence(run.folder("points")),
         content=_content(run.folder("content")),
         masks=_mask_doubts(run),
-        unread_masks=tuple(event.reason for event in run.events if event.label == UNREAD),
+        unread=tuple(event.reason for event in run.events if event.label == UNREAD),
         footage=tuple(_footage_notes(run)),
         colours={name: video["colour"] for name, video in read_videos(sync_folder).items()} if sync_folder else {},
         unlike=_points_notes(run).get("unlike", {}),

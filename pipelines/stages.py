@@ -23,7 +23,8 @@ from pipelines.request import STAGES
 from pipelines.space import check_space
 from sync.capture import find_capture, find_plate
 from sync.clock import ClockMode
-from sync.masks import find_masks, masks_unread
+from sync.masks import find_masks
+from sync.nearby import unread
 from tasks.artefacts.jobs import CancelledError
 from tasks.artefacts.stage import Files, Stage
 from tasks.artefacts.store import Key
@@ -43,11 +44,11 @@ from tasks.stages.fitting import (
 )
 from tasks.stages.footage import MaskedTake, PictureOptions, Take
 from tasks.stages.light import MeasureLight, is_steady
-from tasks.stages.masks import UNREAD, CheckMasks, CheckUnseenMasks, MatchMasks, believed
+from tasks.stages.masks import CheckMasks, CheckUnseenMasks, MatchMasks, believed
 from tasks.stages.plan import Plan
 from tasks.stages.preview import Preview
 from tasks.stages.scale import ScaleRig, known_of
-from tasks.stages.synchronize import synchronize
+from tasks.stages.synchronize import UNREAD, synchronize
 from tasks.stages.track import (
     RAFT,
     ChooseDatedKeyframes,
@@ -163,6 +164,8 @@ class Sequence:
     def matched(self) -> Key:
         """Which frames belong together; raises ValueError or FileNotFoundError for what a run refuses until then."""
         find_plate(find_capture(self.plan.capture))  # whose absence should not show hours later
+        for note in unread(self.workshop.capture):
+            self.workshop.listener.skipped(UNREAD, note)
         self._match_masks()
         options, starts = self.options, None
         if options.sync.clock is ClockMode.CONTENT:
@@ -171,8 +174,6 @@ class Sequence:
 
     def _match_masks(self) -> None:
         capture, workshop = self.workshop.capture, self.workshop
-        for note in masks_unread(capture):
-            workshop.listener.skipped(UNREAD, note)
         if masks := find_masks(capture):
             videos = workshop.files({camera: capture.videos[camera] for camera in masks}, "reading videos")
             # Nothing is made of it: who only looks goes on, and a cancelled run ends where it works next.

@@ -18,6 +18,8 @@ SIGNIFICANCE = 3.0
 """Standard errors by which an offset must differ from what the times say: tens of cameras are looked at at once"""
 DECIDED = 1 / SIGNIFICANCE
 """Standard error, in instants, up to which a camera's times are taken to be looked at: a whole frame would be named"""
+POOLED = 4
+"""Of as many blocks the typical error of all cameras enters that of each, which few blocks tell roughly"""
 MILDEST, MILDEST_MEAN = 0.8, 0.44
 """Share of the cameras, those nearest to 0, whose offsets tell how right their errors are, and the mean square that
 these have in standard errors if they are"""
@@ -160,12 +162,13 @@ def find_offsets(
     usual = _usual([own.instants + places[camera] for camera, own in found.items()])
     said = [(expected or {}).get(name, 0.0) for name in names]
     told = _told(found, places - usual, said)
-    scatter = _scatter(told)
-    told = _less_sure(told, scatter)
+    told = _with_errors_of(told, _pooled([own.error for own in told.values()]))
+    told = _with_errors_of(told, _scatter(told) * np.array([own.error for own in told.values()]))
     sure = [camera for camera, own in told.items() if own.decided]
     if len(sure) < len(told) and any(own.lies for own in told.values()):
         again = _measure([cameras[camera] for camera in sure], places[sure], reach)
-        still = _less_sure(_told({sure[row]: own for row, own in again.items()}, places - usual, said), scatter)
+        still = _told({sure[row]: own for row, own in again.items()}, places - usual, said)
+        still = {camera: replace(own, error=told[camera].error) for camera, own in still.items()}
         told |= {camera: _doubted(own) for camera, own in told.items() if own.lies and not _lies_in(still, camera)}
     return {names[camera]: own for camera, own in told.items()}
 
@@ -178,8 +181,15 @@ def _scatter(told: Mapping[int, Offset]) -> float:
     return float(np.clip(np.sqrt(np.mean(mildest) / MILDEST_MEAN), 1.0, MOST_SCATTER)) if mildest else 1.0
 
 
-def _less_sure(told: Mapping[int, Offset], factor: float) -> dict[int, Offset]:
-    return {camera: replace(own, error=own.error * factor) for camera, own in told.items()}
+def _pooled(errors: Sequence[float]) -> np.ndarray:
+    """Errors [C] drawn towards the typical one: that of a camera comes from a few blocks of instants alone."""
+    own, usual = np.array(errors), float(np.median(errors)) if errors else 0.0
+    pooled: np.ndarray = np.sqrt(((BLOCKS - 1) * own**2 + POOLED * usual**2) / (BLOCKS - 1 + POOLED))
+    return pooled
+
+
+def _with_errors_of(told: Mapping[int, Offset], errors: np.ndarray) -> dict[int, Offset]:
+    return {camera: replace(own, error=float(error)) for (camera, own), error in zip(told.items(), errors, strict=True)}
 
 
 def _lies_in(found: Mapping[int, Offset], camera: int) -> bool:

@@ -300,8 +300,8 @@ class ReportInput:
     content: Content | None = None
     masks: Mapping[str, str] = field(default_factory=dict)
     """Cameras whose foreground masks are not used, and why"""
-    unread_masks: tuple[str, ...] = ()
-    """Folders that seem to hold some, and why they are not read"""
+    unread: tuple[str, ...] = ()
+    """What of the capture seems to be masks, times or a calibration, and why it is not read"""
     footage: tuple[str, ...] = ()
     """What was read of the videos and what was not, where it is not plain, and which pictures are damaged"""
     colours: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

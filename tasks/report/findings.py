@@ -106,6 +106,7 @@ def _run_findings(report: ReportInput) -> Iterator[Finding]:
 
 
 def _sync_findings(report: ReportInput, limits: Limits) -> Iterator[Finding]:
+    yield from (Finding("sync", f"{note}.") for note in report.unread)
     if report.sync is None:
         return
     for row in report.sync.cameras:
@@ -276,7 +277,6 @@ def _motion_findings(report: ReportInput) -> Iterator[Finding]:
 
 
 def _mask_findings(report: ReportInput) -> Iterator[Finding]:
-    yield from (Finding("motion", f"{note}.") for note in report.unread_masks)
     for name, why in report.masks.items():
         yield Finding(
             "motion",

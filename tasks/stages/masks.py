@@ -20,8 +20,6 @@ from tasks.stages.footage import Footage, Take
 from tasks.stages.track import MOTION
 
 AGREEMENT = "masks.json"
-UNREAD = "mask folder"
-"""As what a run says which of them it passed over"""
 MOST_OUTSIDE = 0.5
 """Share of what moves that may lie outside the masks: shadows and things that nobody masked move, too"""
 SHIFT_GAIN = 0.05

@@ -35,6 +35,8 @@ STARTS = "starts.json"
 STARTS_NS = "starts_ns"
 """Key of the same in the header of a scene"""
 BY_CONTENT = "what the cameras saw or heard"
+UNREAD = "not read"
+"""As what a run says what beside the videos seems to belong to them"""
 FOOTAGE = "footage"
 """Name of the notes on what was read of the videos, and what was not; missing where there are none"""
 
