@@ -61,6 +61,9 @@ def _intrinsics(values: Mapping[str, Any], picture: str) -> tuple[float, float, 
         return number(values[key], f"{picture}: {key}") if values.get(key) is not None else otherwise
 
     width, height = whole(values["w"], f"{picture}: w"), whole(values["h"], f"{picture}: h")
-    fx = of("fl_x", 0.0) or width / 2 / math.tan(of("camera_angle_x", 0.0) / 2)
+    half = math.tan(of("camera_angle_x", 0.0) / 2)
+    fx = of("fl_x", 0.0) or (width / 2 / half if half else 0.0)
+    if fx <= 0:
+        raise ValueError(f"{picture}: fl_x must be above 0, or camera_angle_x between 0 and pi")
     fy = of("fl_y", 0.0) or fx
     return fx, fy, of("cx", width / 2), of("cy", height / 2), width, height

@@ -246,6 +246,7 @@ def test_colmap_without_blank_lines_is_refused_instead_of_losing_every_second_ca
         ({"fl_x": float("nan")}, "fl_x must be a finite number"),
         ({"h": 360.5}, "h must be a whole number, but is 360.5"),
         ({"fl_x": None, "w": 5}, "float"),
+        ({"fl_x": 0}, "fl_x must be above 0"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "must hold a rotation"),
         ({"transform_matrix": [[1]]}, r"must be \[4, 4\] or \[3, 4\], not \(1, 1\)"),
     ],
