@@ -18,6 +18,8 @@ SIGNIFICANCE = 3.0
 """Standard errors by which an offset must differ from what the times say: tens of cameras are looked at at once"""
 DECIDED = 1 / SIGNIFICANCE
 """Standard error, in instants, up to which a camera's times are taken to be looked at: a whole frame would be named"""
+SHORT_OF_A_FRAME = 2.0
+"""Standard errors by which an offset must stay below a whole frame for the times to be confirmed"""
 POOLED = 4
 """Of as many blocks the typical error of all cameras enters that of each, which few blocks tell roughly"""
 MILDEST, MILDEST_MEAN = 0.8, 0.44
@@ -75,8 +77,9 @@ class Offset:
 
     @property
     def decided(self) -> bool:
-        """Whether a whole frame would have been noticed, or more has been."""
-        return self.lies or (not self.by_chance and self.error <= DECIDED)
+        """Whether a whole frame would have been noticed, or more has been; what lies between is neither."""
+        near = abs(self.away) + SHORT_OF_A_FRAME * self.error < 1
+        return self.lies or (not self.by_chance and self.error <= DECIDED and near)
 
     @property
     def away(self) -> float:

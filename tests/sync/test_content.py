@@ -131,6 +131,16 @@ def test_pictures_that_agree_nowhere_tell_nothing():
         assert np.isfinite([own.instants, own.error]).all()
 
 
+def test_a_whole_frame_that_is_not_sure_is_no_confirmation():
+    for away in np.linspace(-1.5, 1.5, 31):
+        for error in np.linspace(0.02, 0.6, 30):
+            offset = Offset(float(away), float(error))
+            assert not (abs(away) >= 0.99 and offset.decided and not offset.lies)
+    assert Offset(0.1, 0.3).decided
+    assert not Offset(0.8, 0.28).lies
+    assert not Offset(0.8, 0.28).decided
+
+
 def _place(own: Activity) -> tuple[np.ndarray | None, np.ndarray | None, int]:
     return own.centre, own.rays, own.width
 
