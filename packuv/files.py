@@ -80,16 +80,23 @@ def open_npz(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
         yield arrays
 
 
+def check_place(path: Path) -> None:
+    """Raise FileNotFoundError where the folder of a file to write is missing, IsADirectoryError where that is one."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"no folder {path.parent} to write {path.name} in; make it first")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; name a file to write")
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A temporary path beside `path`, of the same suffix; its file gets the name `path` when the block ends well.
 
     The bytes are on the disk before the name is given; an error in the block leaves nothing behind. Raises
-    FileNotFoundError where the folder is missing.
+    what `check_place` raises.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"no folder {path.parent} to write {path.name} in; make it first")
+    check_place(path)
     partial = partial_path(path, path.suffix)
     try:
         yield partial

@@ -128,7 +128,8 @@ def _outcome(words: Sequence[str]) -> int:
 
 def _afterwards(arguments: argparse.Namespace) -> str:
     """What the same command would do after it was stopped."""
-    return f"the same command {'goes on from here' if hasattr(arguments, 'preset') else 'begins anew'}"
+    keeps = getattr(arguments, "command", "") in ("run", *SINGLE, "batch")
+    return f"the same command {'goes on from here' if keeps else 'begins anew'}"
 
 
 def _parsed(words: Sequence[str]) -> argparse.Namespace:

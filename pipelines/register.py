@@ -29,6 +29,8 @@ FITTED = ("backdrop", "key", "segment")
 """Stages whose artefacts can be looked at while a run goes on"""
 SAVE_SECONDS = 2.0
 """Least time between two notes of progress"""
+KILLED = "fitted"
+"""In the run.json of a run that was killed: what it had fitted"""
 HEARTBEAT_SECONDS = 20.0
 """Between two notes at the latest, for those who do not see the lock"""
 SILENT_SECONDS = LEASE_SECONDS
@@ -213,6 +215,7 @@ def _note_killed(found: Found) -> None:
             asked = {"capture": record.capture, "preset": record.preset}
             facts = {"outcome": "killed", "reason": found.ending, "started": record.started, "finished": record.updated}
             kept = {name: earlier[name] for name in ("artefacts",) if name in earlier}
+            kept[KILLED] = list(record.fitted)
             write_json(path, {"sequence": record.sequence, **facts, "request": asked, "stages": [], **kept})
 
 

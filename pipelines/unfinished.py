@@ -25,7 +25,7 @@ from packuv.gaussians.codes import Codes
 from packuv.gaussians.segment import Segment
 from packuv.score import as_pixels
 from packuv.viewer.source import locate
-from pipelines.register import find_runs
+from pipelines.register import KILLED, find_runs
 from tasks.artefacts.recipe import restore
 from tasks.artefacts.retention import RUN
 from tasks.artefacts.stage import Site
@@ -91,7 +91,8 @@ def _made(folder: Path) -> list[Key]:
         names = list(runs[-1].record.fitted)
     else:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            names = [item["artefact"] for item in json.loads((folder / RUN).read_text())["artefacts"]]
+            told = json.loads((folder / RUN).read_text())
+            names = told.get(KILLED) or [stage["artefact"] for stage in told["stages"] if "artefact" in stage]
     return [_key(name) for name in names]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from packuv.gaussians.segment import Segment
 from packuv.metrics import decibels
 from packuv.progress import Progress, Ticks, no_progress
 from packuv.raster import Arena, RasterOptions, render
-from packuv.scene import EncodeOptions, Scene, SceneHeader, open_scene, write_scene
+from packuv.scene import EncodeOptions, Scene, open_scene, write_scene
 from packuv.scene.header import COMPRESSION
 
 FRAMES, CAMERAS = 3, 12
@@ -28,6 +28,8 @@ TRIALS = 14
 FINEST = 1e-10
 """Noise of the finest steps that are tried, mean squared error of each kind of code"""
 COARSEST = 0.03
+LONGEST = {"psnr_db": -100.123, "psnr_held_out_db": -100.123, "loss_db": -100.1234}
+"""Figures that take as many characters as any, in the header of trials"""
 RATIO_TOLERANCE, LOSS_TOLERANCE = 0.02, 0.03
 """Shares of the goal by which the result may stay on the safe side of it"""
 
@@ -120,7 +122,7 @@ class _Work:
         learned = self._judge.learned
         self._ticks = Ticks(progress, len(learned) * len(self._judge.frames) + TRIALS + 1)
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, seed=seed, ticks=self._ticks)
-        self._source_bytes = scene.path.stat().st_size
+        self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
         self._folder = Path()
         self._segments: list[Path] = []
 
@@ -164,29 +166,21 @@ class _Work:
     def write(self, target: Path, noise: float) -> Compressed:
         """The file itself, whose header says what was done to it."""
         found = self._trial(noise)
-        steps, header = found.steps, self._scene.header
-        said = {
-            "source": _digest(self._scene),
-            "source_bytes": found.source_bytes,
-            "position_steps": steps.position.tolist(),
-            "position_multiple": steps.multiple,
-            "attribute_steps": steps.attribute.tolist(),
+        unseen = found.psnr_held_out_db and round(found.psnr_held_out_db, 3)
+        figures = {
             "psnr_db": round(found.psnr_db, 3),
-            "psnr_held_out_db": found.psnr_held_out_db and round(found.psnr_held_out_db, 3),
+            "psnr_held_out_db": unseen,
             "loss_db": round(found.loss_db, 4),
-            "fitted_db": self._goal.fitted_db,
-            "cameras": [camera.name for camera in self._judge.cameras],
-            "frames": list(self._judge.frames),
         }
-        size = self._encode(target, steps, replace(header, extra={**header.extra, COMPRESSION: said}))
+        size = self._encode(target, found.steps, figures)
         self._ticks.advance()
         return replace(found, bytes=size)
 
     def _trial(self, noise: float) -> Compressed:
-        """Write and look at a file of this noise."""
+        """Write and look at a file of this noise, as long as the one that says what was found."""
         steps = Steps.of_noise(noise, self._sensitivity, self._scene.header.quantizer)
         path = self._folder / "trial.mkv"
-        size = self._encode(path, steps, self._scene.header)
+        size = self._encode(path, steps, LONGEST)
         error, unseen = self._judge.errors(path)
         self._ticks.advance()
         psnr_db = decibels(error)
@@ -194,14 +188,30 @@ class _Work:
         loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)
         return Compressed(self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps)
 
-    def _encode(self, path: Path, steps: Steps, header: SceneHeader) -> int:
-        """Write the scene in these steps; its size in bytes."""
+    def _encode(self, path: Path, steps: Steps, figures: Mapping[str, Any]) -> int:
+        """Write the scene in these steps, with these figures in its header; its size in bytes."""
         coarse = [self._folder / f"coarse{number}.npz" for number in range(len(self._segments))]
         for number, place in enumerate(coarse):
             steps.segment(Segment.load(self._segments[number])).save(place)
         options = EncodeOptions(steps.tolerance)
-        stated = replace(header, quantizer=steps.quantizer(header.quantizer))
+        header = self._scene.header
+        said = {**self._said(steps), **figures}
+        extra = {**header.extra, COMPRESSION: said}
+        stated = replace(header, quantizer=steps.quantizer(header.quantizer), extra=extra)
         return write_scene(path, coarse, stated, options=options, threads=self._threads).bytes
+
+    def _said(self, steps: Steps) -> dict[str, Any]:
+        """What the header says of how it was compressed, but for what was found."""
+        return {
+            "source": self._source,
+            "source_bytes": self._source_bytes,
+            "position_steps": steps.position.tolist(),
+            "position_multiple": steps.multiple,
+            "attribute_steps": steps.attribute.tolist(),
+            "fitted_db": self._goal.fitted_db,
+            "cameras": [camera.name for camera in self._judge.cameras],
+            "frames": list(self._judge.frames),
+        }
 
 
 class Judge:

@@ -7,6 +7,7 @@ that it declares; SH above band 0 are bytes over -4..4, and colours are cut to 0
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -117,5 +118,6 @@ class _Spans:
 
 def _as_bytes(gaussians: Gaussians) -> np.ndarray:
     """All values of each as one, [n]."""
-    rows = np.concatenate([array.reshape(len(gaussians), -1) for array in arrays(gaussians)], axis=1)
+    flat = (array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays(gaussians))
+    rows = np.concatenate(list(flat), axis=1)
     return np.ascontiguousarray(rows).view(f"V{4 * rows.shape[1]}")[:, 0]

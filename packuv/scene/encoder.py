@@ -207,10 +207,11 @@ class SceneEncoder:
         )
 
     def finish(self) -> SceneIndex:
-        """Wait for the last pictures; the index of what the spool holds."""
+        """Wait for the last pictures; the index of what the spool holds. Where all that moves stays within the
+        tolerance, nothing is put into the second track, and there is none."""
         self._queue.drain(0)
-        entries = (writer.entry for writer in self._writers)
-        parts = zip(entries, self._queue.sizes, self._queue.crc32, strict=True)
+        written = zip(self._writers, self._queue.sizes, self._queue.crc32, strict=True)
+        parts = [(writer.entry, sizes, crc) for writer, sizes, crc in written if sizes]
         tracks = tuple(replace(entry, sizes=tuple(sizes), crc32=tuple(crc)) for entry, sizes, crc in parts)
         segments, digests = tuple(self._segments), tuple(self._digests)
         return SceneIndex(self._header, self._tolerance, tracks, segments, digests, _tools())

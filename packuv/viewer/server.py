@@ -72,10 +72,15 @@ def serve(
     frame to mark as the one with the lowest score, `truth` what to lay beside. Raises FileNotFoundError for a missing
     file, ValueError for one that is no scene, or where the port or the host cannot be had.
     """
-    if not 0 <= port < 2**16:
-        raise ValueError(f"a port is a number from 0 to {2**16 - 1}, but is {port}")
+    check_port(port)
     with open_source(scene_path) as source, bound(host, port, source, worst=worst, truth=truth) as server:
         answer_until_interrupted(server, open_browser=open_browser, announce=announce)
+
+
+def check_port(port: int) -> None:
+    """Raise ValueError for what is no port."""
+    if not 0 <= port < 2**16:
+        raise ValueError(f"a port is a number from 0 to {2**16 - 1}, but is {port}")
 
 
 def answer_until_interrupted(
@@ -133,8 +138,8 @@ class ViewerServer(ThreadingHTTPServer):
         super().__init__(address, _Handler)
         self.worst, self._grown = worst, grown
         self.source, self.truth, self.bodies = source, truth, Bodies(source)
-        self.made = 0
-        """Counts the states of what grows"""
+        self.made = time.time_ns() // 1_000_000
+        """Counts the states of what grows, from a number that no server before this one had"""
         self._looking = threading.Lock()
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
 

@@ -527,7 +527,7 @@ function spanText() {
 // Ask now and then, but not while somebody is at it, and come back to the same view where there is more.
 async function lookForMore() {
   const idle = performance.now() - touched > IDLE_MS;
-  const now = idle ? await fetch("scene.json").then((answer) => answer.json(), () => null) : null;
+  const now = idle ? await fetch("scene.json").then((answer) => answer.json()).catch(() => null) : null;
   if (!now || now.made === scene.made) return setTimeout(lookForMore, LOOK_MS);
   putHere(Number(player.playing));
   location.reload();

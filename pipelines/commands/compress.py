@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from packuv.files import check_place
 from packuv.partial import partial_path
 from pipelines.commands.terminal import print_facts, shown
 from pipelines.disk import size_text
@@ -25,6 +26,7 @@ def command(arguments: argparse.Namespace) -> int:
     """Exit code 2 where the goal is out of reach; then nothing is written."""
     from packuv.compress import Goal
 
+    check_place(arguments.output)
     filmed = _scores(arguments, arguments.scene) if arguments.capture else None
     fitted = {"fitted_db": filmed["psnr_db"]} if filmed else {}
     if arguments.fitted_db is not None:
@@ -40,7 +42,7 @@ def command(arguments: argparse.Namespace) -> int:
         "psnr_held_out_db": found.psnr_held_out_db,
         "loss_db": found.loss_db,
         "fitted_db": goal.fitted_db,
-        "fitted_db_from": "capture" if filmed else "given" if fitted else "assumed",
+        "fitted_db_from": "given" if arguments.fitted_db is not None else "capture" if filmed else "assumed",
         "position_steps": (found.steps.position * found.steps.multiple).tolist(),
         "attribute_steps": found.steps.attribute.tolist(),
     }

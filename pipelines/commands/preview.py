@@ -47,8 +47,9 @@ def view_run(folder: Path, capture: Path | None, host: str, port: int) -> None:
 
     Raises FileNotFoundError where nothing is fitted, and no run goes on.
     """
-    from packuv.viewer.server import answer_until_interrupted, bound
+    from packuv.viewer.server import answer_until_interrupted, bound, check_port
 
+    check_port(port)
     growth, told = Growth(folder, capture), False
     while (first := growth.look()) is None:
         if not goes_on(folder):

@@ -414,9 +414,13 @@ class Filmed:
 
 
 def _capture_of(folder: Path) -> Path | None:
-    """Of the run that a folder is of, where it is still there."""
+    """Of the run that a folder is of, be it under way or the last one, where it is still there."""
+    from pipelines.register import find_runs
+
+    runs = find_runs(folder)
     try:
-        capture = Path(json.loads((folder / "run.json").read_text())["request"]["capture"])
+        told = json.loads((folder / "run.json").read_text()) if not runs else {}
+        capture = Path(runs[-1].record.capture if runs else told["request"]["capture"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return capture if capture.is_dir() else None

@@ -194,7 +194,13 @@ def _silhouettes(capture: Path, views: Views) -> tuple[Silhouettes | None, dict[
 
 
 def _lenses(extra: Mapping[str, Any]) -> dict[str, LensCamera]:
-    """The scene's cameras as they film, by name."""
+    """The scene's cameras as they film, by name. Raises ValueError where a scene does not tell, as imported ones do
+    not."""
+    if "lenses" not in extra:
+        raise ValueError(
+            "what was filmed can be compared with a scene that says how its cameras film (extra.lenses), but this one "
+            "does not, as imported ones; leave the capture out"
+        )
     listed = items(field(extra, "lenses", "the scene's header: extra"), "extra: lenses", most=MOST_CAMERAS)
     return {lens.pinhole.name: lens for lens in map(LensCamera.from_json, listed)}
 

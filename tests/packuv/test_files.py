@@ -71,3 +71,10 @@ def test_an_error_leaves_nothing_behind(tmp_path, whole):
     assert not list(tmp_path.iterdir())
     with pytest.raises(FileNotFoundError, match=r"no folder .*none to write a in"), whole(tmp_path / "none" / "a"):
         pass
+
+
+def test_a_file_is_not_written_over_a_folder(tmp_path):
+    with pytest.raises(IsADirectoryError, match="is a folder; name a file"), whole_file(tmp_path):
+        pass
+    with pytest.raises(FileNotFoundError, match="make it first"), whole_file(tmp_path / "none" / "a.npz"):
+        pass

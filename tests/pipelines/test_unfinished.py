@@ -19,11 +19,11 @@ from packuv.gaussians.segment import Segment
 from packuv.viewer import ViewerServer
 from pipelines.commands.preview import Growth, view_run
 from pipelines.events import Journal
-from pipelines.register import registered
+from pipelines.register import bury, find_runs, registered
 from pipelines.unfinished import Unfinished, find_parts
 from sync.align import AlignOptions, align
 from sync.timecode import Timecodes
-from tasks.artefacts.recipe import write_json
+from tasks.artefacts.recipe import plain, write_json
 from tasks.artefacts.store import SCRATCH, Store
 from tasks.stages.fitting import SEGMENT
 from tasks.stages.footage import RIG, Take
@@ -150,8 +150,26 @@ def test_what_a_stopped_run_left_is_shown(tmp_path):
     fitting = Fitting(folder, journal)
     fitting.key(0)
     names = [str(event.key) for event in journal.events]
-    write_json(folder / "run.json", {"artefacts": [{"artefact": name} for name in names]})
+    write_json(folder / "run.json", {"stages": [{"artefact": name} for name in names]})
     assert told(folder) == [(0, 1, False)]
+
+
+def test_what_a_killed_run_left_is_shown_before_and_after_it_is_buried(tmp_path):
+    journal, folder = Journal(), tmp_path / "dance"
+    facts = {"sequence": "dance", "capture": "/data/dance", "preset": "draft"}
+    with registered(folder, **facts) as register, journal.heard_by(register):
+        Fitting(folder, journal).key(0)
+        (found,) = find_runs(folder)
+    write_json(found.path, plain(found.record))
+    assert told(folder) == [(0, 1, False)]
+    bury(folder, lambda place: None)
+    assert find_runs(folder) == []
+    assert told(folder) == [(0, 1, False)]
+
+
+def test_a_port_that_is_none_is_refused_before_anything_is_waited_for(fitting):
+    with pytest.raises(ValueError, match="a port is a number"):
+        view_run(fitting.folder, None, "127.0.0.1", 99999)
 
 
 def test_where_nothing_is_fitted_and_nobody_is_at_it_the_cure_is_said(tmp_path):
@@ -174,12 +192,13 @@ def test_a_page_learns_of_more_and_its_old_numbers_are_over(fitting):
         Thread(target=server.serve_forever, daemon=True).start()
         with contextlib.ExitStack() as stack:
             stack.callback(server.shutdown)
-            assert scene(server) == (0, 1)
-            assert status(server, "layers/0.bin?made=0") == 200
+            made, frames = scene(server)
+            assert frames == 1
+            assert status(server, f"layers/0.bin?made={made}") == 200
             fitting.segment(0, 5)
-            assert scene(server) == (1, 5)
-            assert status(server, "layers/0.bin?made=0") == 410
-            assert status(server, "frames/4.bin?made=1") == 200
+            assert scene(server) == (made + 1, 5)
+            assert status(server, f"layers/0.bin?made={made}") == 410
+            assert status(server, f"frames/4.bin?made={made + 1}") == 200
 
 
 def scene(server):

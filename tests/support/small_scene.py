@@ -48,10 +48,10 @@ def small_segments() -> list[Segment]:
     return segments
 
 
-def small_scene(path: Path) -> Path:
-    """Write it, lossless."""
+def small_scene(path: Path, segments: list[Segment] | None = None) -> Path:
+    """Write it, lossless, or other segments of as many frames."""
     paths = [path.with_name(f"{number}.npz") for number in range(2)]
-    for place, segment in zip(paths, small_segments(), strict=True):
+    for place, segment in zip(paths, segments or small_segments(), strict=True):
         segment.save(place)
     cameras = tuple(_camera(f"cam{number}", 0.5 * number) for number in range(3))
     times = np.arange(FRAMES, dtype=np.int64) * 40_000_000

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from packuv.colour import linear_from_srgb, srgb_from_linear
+from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.floats import SH_C0, drawn, lit_gaussians, opacity, rows_of
 from packuv.interchange import DOORS, WRITTEN, SplatFormat, antialiased, format_of, read_gaussians, write_gaussians
 from packuv.interchange.clip import Baking, Clip, ClipOptions, Part, baking_error
@@ -20,7 +21,7 @@ from packuv.interchange.sog_writer import _codebook, _groups
 from packuv.scene import open_scene
 from pipelines.cli import SPLAT_FORMATS
 from tests.support.needs import needs
-from tests.support.small_scene import FRAMES, MOVING, ROWS, small_scene
+from tests.support.small_scene import FRAMES, MOVING, ROWS, small_scene, small_segments
 from tests.support.splats import FIELDS, alpha_of, random_gaussians, rotation_error
 
 FRAME_FORMATS = [kind for kind in WRITTEN if kind.door.write and kind.door.read]
@@ -338,6 +339,22 @@ def test_fourdgs_shows_each_frame_at_its_time(scene, tmp_path):
         truth = np.stack([half_turn(frame).means for frame in opened])  # [T, N, 3]
         assert np.array_equal(sources[:, 0] == 1, born >= FRAMES // 2)
         assert np.abs(whole.positions - truth[born, sources[:, 1]]).max() <= 2 * step  # the row says which it is
+
+
+@needs_fourdgs
+def test_a_frame_without_anybody_is_a_frame_of_4dgs(tmp_path):
+    segments = small_segments()
+    nobody = segments[0].key.attributes.copy()
+    nobody[:, OPACITY] = 0
+    segments[0].attributes[:, :, OPACITY] = 0
+    segments[0] = replace(segments[0], key=Codes(segments[0].key.xyz, nobody))
+    with open_scene(small_scene(tmp_path / "scene.mkv", segments)) as opened:
+        later = len(drawn(opened.gaussians(FRAMES - 1)))
+        clip = Clip(opened, range(FRAMES), ClipOptions())
+        assert SplatFormat.FOURDGS.door.write_clip(tmp_path / "a.4dgs", clip) == clip.drawn >= later > 0
+        with pytest.raises(ValueError, match="holds a Gaussian at least"):
+            SplatFormat.FOURDGS.door.write_clip(tmp_path / "b.4dgs", Clip(opened, range(1), ClipOptions()))
+    assert not (tmp_path / "b.4dgs").exists()
 
 
 @pytest.mark.parametrize(

@@ -340,6 +340,20 @@ def test_a_lossy_scene_says_so_and_stays_within_its_tolerance(lossy_file, scene_
     assert worst == [20, 2]
 
 
+def test_a_scene_that_moves_within_its_tolerance_needs_no_second_track(tmp_path):
+    rng = np.random.default_rng(0)
+    key = Codes(rng.integers(100, 65000, (50, 3), np.uint16), rng.integers(9, 250, (50, 10), np.uint8))
+    xyz = np.stack([key.xyz + rng.integers(0, 3, key.xyz.shape, np.uint16) for _ in range(4)])
+    moving = Segment(0, key, np.ones(50, bool), xyz, np.repeat(key.attributes[None], 4, 0))
+    options = EncodeOptions(tolerance=Tolerance(2, 1))
+    summary = write_scene(tmp_path / "scene.mkv", save(tmp_path, [moving]), make_header(5), options=options)
+    assert set(summary.track_bytes) == {"key"}
+    with open_scene(tmp_path / "scene.mkv") as scene:
+        found = np.stack([scene.codes(frame).xyz.astype(int) for frame in range(1, 5)])
+    wanted = next(stored_segments([moving], references=[None])).xyz
+    assert np.abs(found - wanted).max() <= 2
+
+
 def test_keys_of_a_lossy_scene_are_exact(lossy_file):
     path, frames = lossy_file
     with open_scene(path) as scene:
