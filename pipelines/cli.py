@@ -64,7 +64,8 @@ class _Help(argparse.HelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         default = action.default
-        shown = isinstance(default, (str, int)) and not isinstance(default, bool) and default != argparse.SUPPRESS
+        shown = isinstance(default, (str, int)) and not isinstance(default, bool)
+        shown = shown and default not in (argparse.SUPPRESS, ":")  # the whole range
         return f"{action.help} (default: %(default)s)" if shown and action.option_strings else action.help
 
 

@@ -25,9 +25,9 @@ def claims(file: Path) -> bool:
 
 def read(file: Path, videos: Videos) -> Reading:
     data = read_json(file)
-    frames = data["frames"]
-    if not isinstance(frames, list):
-        raise ValueError("transforms.json must list its pictures under frames")
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise ValueError("it must list its pictures under frames, each with what belongs to it")
     return Reading([_view(data, frame) for frame in frames])
 
 

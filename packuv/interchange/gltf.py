@@ -32,7 +32,9 @@ def write_gltf(path: Path, gaussians: Gaussians, *, keep_rows: bool = False) -> 
     mask = is_drawn(gaussians)
     kept = half_turn(rows_out(gaussians, mask, keep_rows=keep_rows))
     if not len(kept):
-        raise ValueError("glTF holds no frame without Gaussians, but this one has none; leave it out, or choose PLY")
+        raise ValueError(
+            f"glTF holds no frame without Gaussians, but that of {path.name} has none; leave it out, or choose PLY"
+        )
     columns = [(name, values.astype("<f4")) for name, values in _attributes(kept)]
     document, data = _document(columns), b"".join(values.tobytes() for _, values in columns)
     text = json.dumps(document, separators=(",", ":")).encode()
