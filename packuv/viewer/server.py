@@ -191,8 +191,9 @@ class ViewerServer(ThreadingHTTPServer):
     def _look_again(self) -> None:
         with self._looking:
             if self._grown and (now := self._grown()):
+                self.made += 1  # first: who has read anything new then finds the state that it asked for over
                 self.source, self.truth = now
-                self.bodies, self.made = Bodies(self.source), self.made + 1
+                self.bodies = Bodies(self.source)
 
     def is_past(self, query: str) -> bool:
         """Whether a page asks for something of a state that is over: frames had other numbers."""
@@ -256,8 +257,6 @@ class _Handler(BaseHTTPRequestHandler):
         if self._is_rebound():
             return self._send(HTTPStatus.FORBIDDEN, b"this viewer answers to localhost only\n", "text/plain", with_body)
         (path, _, query), started = self.path.partition("?"), time.perf_counter()
-        if self.server.is_past(query):
-            return self._send(HTTPStatus.GONE, b"there is more by now\n", "text/plain", with_body)
         try:
             found = self.server.content(path)
         except Exception as error:  # a damaged file must reach the page as words, not as a dropped connection
@@ -267,6 +266,8 @@ class _Handler(BaseHTTPRequestHandler):
             return self._send(status, message, "text/plain; charset=utf-8", with_body)
         if found is None:
             return self._send(HTTPStatus.NOT_FOUND, b"nothing here\n", "text/plain; charset=utf-8", with_body)
+        if self.server.is_past(query):
+            return self._send(HTTPStatus.GONE, b"there is more by now\n", "text/plain", with_body)
         self._decode_ms = 1000 * (time.perf_counter() - started)
         if "deflate" in self.headers.get("Accept-Encoding", ""):
             return self._send(HTTPStatus.OK, found.deflated, found.kind, with_body, encoding="deflate")
