@@ -10,21 +10,18 @@ import contextlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
 
-from packuv.colour import lit
 from packuv.fit.frames import done_so_far, unfinished_segment
 from packuv.fit.keyframe import KeyState
-from packuv.footage import Views
 from packuv.gaussians.codes import Codes
 from packuv.gaussians.segment import Segment
-from packuv.score import as_pixels
 from packuv.viewer.source import locate
+from pipelines.filmed import Filmed
 from pipelines.register import KILLED, find_runs
 from tasks.artefacts.recipe import restore
 from tasks.artefacts.retention import RUN
@@ -137,7 +134,7 @@ class Unfinished:
         self.light = header.light[instants]
         self.times_ns = np.array([int(frame * 10**9 / header.rate) for frame in range(len(instants))], np.int64)
         self.segments = tuple(range(end - part.frames, end) for end, part in zip(ends, parts, strict=True))
-        self.truth = FilmedThen(footage, instants) if capture else None
+        self.truth = Filmed(everyone.cameras, footage.open_views, instants, self.light) if capture else None
         # What is under way will not be read as it is now again.
         self._moving = {number: part.load() for number, part in enumerate(parts) if part.under_way}
         self._finished = lru_cache(maxsize=KEPT_SEGMENTS)(lambda number: parts[number].load())
@@ -166,31 +163,8 @@ class Unfinished:
         return part.frame(offset)[part.dynamic]
 
     def _part(self, number: int) -> Segment:
-        found: Segment = self._moving.get(number) or self._finished(number)
+        found: Segment = self._moving[number] if number in self._moving else self._finished(number)
         return found
-
-
-class FilmedThen:
-    """What cameras filmed at instants of a take, see `packuv.viewer.source.Truth`."""
-
-    def __init__(self, footage: Footage, instants: np.ndarray) -> None:
-        self.cameras = footage.take.cameras
-        self._footage, self._instants, self._guard = footage, instants, Lock()
-
-    def picture(self, camera: str, frame: int) -> np.ndarray | None:
-        instant = int(self._instants[frame])
-        with self._guard:
-            picture = self._views.picture(self.cameras.index(camera), instant)
-        return None if picture is None else as_pixels(lit(picture, self._light[instant]))
-
-    @cached_property
-    def _views(self) -> Views:
-        return self._footage.open_views()
-
-    @cached_property
-    def _light(self) -> np.ndarray:
-        light = self._footage.load_light()
-        return light.light if light else np.zeros((len(self._views), 3))
 
 
 def _take(recipe: Mapping[str, Any]) -> Take:

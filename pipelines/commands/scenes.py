@@ -10,9 +10,7 @@ import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
-from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from pipelines.commands.frames import frames_of
@@ -27,9 +25,9 @@ if TYPE_CHECKING:
 
     from packuv.camera import PinholeCamera
     from packuv.film import CameraPath
-    from packuv.footage import Views
     from packuv.scene import SceneHeader
     from packuv.scene.verify import VerifyReport
+    from pipelines.filmed import Filmed
 
 MOST_STARTS = 16
 """First frames of segments that `packuv info` names"""
@@ -374,7 +372,7 @@ def _view_scene(path: Path, arguments: argparse.Namespace) -> None:
 
     worst, capture = _worst_frame(path.parent), arguments.capture or _capture_of(path.parent)
     with open_scene(path) as scene:
-        truth = Filmed(scene.header, capture) if capture else None
+        truth = filmed(scene.header, capture) if capture else None
     serve(path, host=arguments.host, port=arguments.port, open_browser=True, worst=worst, truth=truth)
 
 
@@ -388,29 +386,17 @@ def _sequence_in(folder: Path) -> Path:
     return found[0]
 
 
-class Filmed:
-    """What a capture's cameras filmed at the frames of a scene, see `packuv.viewer.source.Truth`. The videos are opened
-    when somebody looks."""
+def filmed(header: SceneHeader, capture: Path) -> Filmed:
+    """What a capture's cameras filmed at the frames of a scene."""
+    import numpy as np
 
-    def __init__(self, header: SceneHeader, capture: Path) -> None:
-        from tasks.stages.evaluate import known_cameras
+    from pipelines.filmed import Filmed
+    from tasks.stages.evaluate import filmed_views, known_cameras
 
-        self.cameras = known_cameras(header)
-        self._header, self._capture, self._guard = header, capture, Lock()
-
-    def picture(self, camera: str, frame: int) -> np.ndarray | None:
-        from packuv.colour import lit
-        from packuv.score import as_pixels
-
-        with self._guard:
-            picture = self._views.picture(self.cameras.index(camera), frame)
-        return None if picture is None else as_pixels(lit(picture, self._header.light[frame]))
-
-    @cached_property
-    def _views(self) -> Views:
-        from tasks.stages.evaluate import filmed_views
-
-        return filmed_views(self._header, self._capture, self.cameras)
+    cameras = known_cameras(header)
+    return Filmed(
+        cameras, lambda: filmed_views(header, capture, cameras), np.arange(len(header.times_ns)), header.light
+    )
 
 
 def _capture_of(folder: Path) -> Path | None:

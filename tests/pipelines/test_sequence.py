@@ -23,7 +23,7 @@ from calibration.rig import Rig
 from packuv.scene import open_scene
 from pipelines.cli import main
 from pipelines.commands.progress import TerminalProgress
-from pipelines.commands.scenes import Filmed, _capture_of, _worst_frame
+from pipelines.commands.scenes import _capture_of, _worst_frame, filmed
 from pipelines.events import Journal
 from pipelines.process import Engine, Outcome, jobs_of, process, process_directly
 from pipelines.request import RunRequest
@@ -122,16 +122,16 @@ def test_the_viewer_of_a_run_finds_what_was_filmed_and_the_worst_frame(first, ca
     assert _worst_frame(outcome.folder) == min(by_frame, key=lambda frame: by_frame[frame])
     assert _worst_frame(capture) is None
     with open_scene(outcome.scene) as scene:
-        filmed = Filmed(scene.header, capture)
+        beside = filmed(scene.header, capture)
     index = outcome.folder / "store" / artefacts(outcome)["evaluate"] / "pictures"
     for item in json.loads((index / "index.json").read_text())["pictures"]:
         truth = cv2.imread(str(index / item["truth"]))[..., ::-1].astype(float)
-        shown = filmed.picture(item["camera"], item["frame"])
+        shown = beside.picture(item["camera"], item["frame"])
         assert shown is not None
         assert np.abs(shown - truth).mean() < 12  # the same but for the camera's gains and exposure
-    assert filmed.picture("cam01", 0).shape == truth.shape
+    assert beside.picture("cam01", 0).shape == truth.shape
     with pytest.raises(ValueError, match="must have"):
-        Filmed(scene.header, capture / "videos").picture("cam01", 0)
+        filmed(scene.header, capture / "videos").picture("cam01", 0)
 
 
 def test_info_and_verify_tell_what_the_scene_is(first, capsys, tmp_path):
