@@ -13,7 +13,6 @@ from itertools import combinations
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from calibration.accept import PairMatches, pair_errors_px
 from calibration.rig import Camera, Rig
@@ -199,6 +198,8 @@ def _fitted(
         mended = _with(rig, names, change, unit * scales)
         errors = [np.minimum(pair_errors_px(mended, pair), FARTHEST_PX) for pair in evidence]
         return np.concatenate([*errors, 0.1 * unit])
+
+    from scipy.optimize import least_squares  # here, since loading it takes 0.5 s, and few cameras need a repair
 
     found = least_squares(
         residuals, np.zeros(len(scales)), loss="soft_l1", f_scale=ROBUST_PX, diff_step=1e-4, max_nfev=60
