@@ -38,6 +38,15 @@ def left(forecast: Forecast) -> str:
     return "" if remaining is None else f"{duration(remaining)} left"
 
 
+def counted(number: int, what: str) -> str:
+    """So many of something.
+
+    >>> counted(1, "frame"), counted(54000, "frame")
+    ('1 frame', '54,000 frames')
+    """
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
 def duration(seconds: float) -> str:
     """A length of time for people.
 

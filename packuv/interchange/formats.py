@@ -78,6 +78,11 @@ class Door:
     def is_written(self) -> bool:
         return self.write is not None or self.write_clip is not None
 
+    @property
+    def endings(self) -> tuple[str, ...]:
+        """What names of its files end in at least: x.ply may be a compressed one."""
+        return tuple(dict.fromkeys(f".{suffix.rpartition('.')[2]}" for suffix in self.suffixes))
+
 
 def read_ply(path: Path) -> Gaussians:
     """Gaussians of a 3DGS PLY, standard or compressed; columns are found by name, others are ignored.
@@ -130,7 +135,7 @@ DOORS: dict[SplatFormat, Door] = {
     ),
 }
 WRITTEN = tuple(kind for kind, door in DOORS.items() if door.is_written)
-READABLE = tuple(dict.fromkeys(f".{door.suffixes[0].rpartition('.')[2]}" for door in DOORS.values() if door.read))
+READABLE = tuple(dict.fromkeys(door.endings[0] for door in DOORS.values() if door.read))
 """Suffixes of the files that `read_gaussians` takes, besides meta.json."""
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.commands.frames import check_frame, frames_of
 from pipelines.commands.terminal import print_facts, shown
 from pipelines.disk import size_text
+from pipelines.words import counted
 
 if TYPE_CHECKING:
     from calibration.rig import Rig
@@ -32,7 +33,7 @@ def export_frames(arguments: argparse.Namespace) -> int:
     from packuv.interchange.clip import Clip, ClipOptions, Part
     from packuv.scene import open_scene
 
-    kind = _splat_format(arguments.format, arguments.output)
+    kind = _splat_format(arguments.format, arguments.output, whole=arguments.frame is None)
     options = ClipOptions(Part(arguments.part), arguments.light == "baked", arguments.keep_rows)
     with open_scene(arguments.scene) as scene:
         if arguments.frame is not None:
@@ -57,8 +58,6 @@ def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat) ->
     frames, output = clip.frames, arguments.output
     span = f"frame {frames[0]}" if len(frames) == 1 else f"frames {frames.start} to {frames.stop - 1}"
     if kind.door.write_clip is not None:
-        if output.suffix.lower() not in kind.door.suffixes:
-            raise ValueError(f"{kind} is one file, named {' or '.join(kind.door.suffixes)}, but not {output.name}")
         count = kind.door.write_clip(output, clip)
         return count, f"{count:,} Gaussians of {span}"
     write = partial(write_gaussians, kind=kind, antialiased=clip.antialiased, keep_rows=clip.options.keep_rows)
@@ -71,7 +70,7 @@ def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat) ->
             count += write(folder / f"{frame:06d}{kind.suffix}", gaussians)
         if not clip.options.bake_light:
             save_json(folder / "light.json", {"frames": list(frames), "gains": clip.gains.tolist()})
-    return count, f"{len(frames)} files, {span}"
+    return count, f"{counted(len(frames), 'file')}, {span}"
 
 
 def _told(clip: Clip, kind: SplatFormat, count: int) -> Iterator[str]:
@@ -95,15 +94,28 @@ def _told(clip: Clip, kind: SplatFormat, count: int) -> Iterator[str]:
         yield f"light      is left out: of {low:.1%} to {high:.1%} of steady light, in which frames are written"
 
 
-def _splat_format(name: str | None, output: Path) -> SplatFormat:
-    """As asked for, or else by the file's name; a folder of frames gets standard PLY."""
+def _splat_format(name: str | None, output: Path, *, whole: bool) -> SplatFormat:
+    """As asked for, or else by the file's name; a folder of frames, as a `whole` sequence may be, gets standard PLY.
+
+    Raises ValueError where the name tells of something else than what is written to it.
+    """
     from packuv.interchange import WRITTEN, SplatFormat, format_of
 
-    found = SplatFormat(name) if name else format_of(output)
+    told = format_of(output)
+    found = SplatFormat(name) if name else told
     if found is None and not output.suffix:
         return SplatFormat.PLY
     if found not in WRITTEN:
-        raise ValueError(f"{output.name} does not tell its format; choose one with --format: {', '.join(WRITTEN)}")
+        why = f"{found} is read, but not written" if found else f"{output.name} does not tell its format"
+        raise ValueError(f"{why}; choose one with --format: {', '.join(WRITTEN)}")
+    one_file = found.door.write_clip is not None
+    if whole and told and not one_file:
+        raise ValueError(
+            f"several frames of {found} are a folder of files, but {output.name} names a file; name a folder and give "
+            f"--format {found}, or choose a frame with --frame"
+        )
+    if (told or one_file) and not output.name.lower().endswith(found.door.endings):
+        raise ValueError(f"{found} is one file, named {' or '.join(found.door.endings)}, but not {output.name}")
     return found
 
 
@@ -125,9 +137,9 @@ def _import_atlas(arguments: argparse.Namespace) -> int:
 
 def _import_atlas_text(facts: Mapping[str, Any]) -> str:
     changed, frames = facts["changed"], facts["frames"]
-    check = f"{changed} of {frames} frames are not" if changed else f"all {frames} frames are"
+    check = f"{changed} of {counted(frames, 'frame')} are not" if changed else f"all {frames} frames are"
     return (
-        f"{facts['file']}: {frames} frames, {facts['gaussians']:,} Gaussians, {size_text(facts['bytes'])}\n"
+        f"{facts['file']}: {counted(frames, 'frame')}, {facts['gaussians']:,} Gaussians, {size_text(facts['bytes'])}\n"
         f"check      {check} the integers that the atlas was made from"
     )
 
@@ -150,16 +162,16 @@ def _import_frames(arguments: argparse.Namespace) -> int:
 
 
 def _import_text(facts: Mapping[str, Any]) -> str:
-    segments = f"{facts['segments']} segment{'s' if facts['segments'] > 1 else ''}"
     dropped = f"{facts['broken']:,} of {facts['gaussians']:,} are broken, {facts['faint']:,} too faint to be drawn"
     lines = [
-        f"{facts['file']}: {facts['frames']} frames in {segments}, {size_text(facts['bytes'])}",
+        f"{facts['file']}: {counted(facts['frames'], 'frame')} in {counted(facts['segments'], 'segment')}, "
+        f"{size_text(facts['bytes'])}",
         f"gaussians  {dropped}; the UV map has no texel for {facts['pruned']:,}",
         f"kept       {_share(facts['kept_share'])} of what is to be drawn, "
         f"{_share(facts['kept_alpha_share'])} of its alpha",
     ]
     if facts["empty"]:
-        lines.append(f"empty      {facts['empty']} of {facts['frames']} frames")
+        lines.append(f"empty      {facts['empty']} of {counted(facts['frames'], 'frame')}")
     if facts["antialiased"]:
         lines.append(
             "opacities  are those of Mip-Splatting, and drawn as others are: what is thin looks thicker from afar"
@@ -272,7 +284,7 @@ def _atlas_text(facts: Mapping[str, Any]) -> str:
     share = facts["seated"] / max(1, facts["gaussians"])
     return "\n".join(
         [
-            f"{facts['file']}: {facts['frames']} frames of {facts['width']}x{facts['height']}, "
+            f"{facts['file']}: {counted(facts['frames'], 'frame')} of {facts['width']}x{facts['height']}, "
             f"{size_text(facts['bytes'])}, {size_text(facts['bytes'] / facts['frames'])} a frame",
             f"tracks     {tracks}",
             f"gaussians  {share:.2%} of those drawn have a texel",
@@ -306,7 +318,8 @@ def _web_text(facts: Mapping[str, Any]) -> str:
     delta, video = (size_text(facts[key] / facts["frames"]) for key in ("delta_bytes", "video_bytes"))
     return "\n".join(
         [
-            f"{facts['folder']}: {facts['frames']} frames, {size_text(facts['bytes'])}; put it on any web server",
+            f"{facts['folder']}: {counted(facts['frames'], 'frame')}, {size_text(facts['bytes'])}; "
+            "put it on any web server",
             f"page       fetches {size_text(facts['delta_bytes'])} to play everything once, {delta} a frame",
             f"video      {size_text(facts['video_bytes'])}, {video} a frame",
             "check      both decode to exactly what the scene holds",

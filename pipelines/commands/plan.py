@@ -17,6 +17,7 @@ from pipelines.commands.terminal import print_table, shown
 from pipelines.dataset import holds_capture
 from pipelines.disk import free_bytes, size_text
 from pipelines.request import RunRequest
+from pipelines.words import counted
 
 if TYPE_CHECKING:
     from pipelines.ahead import Ahead
@@ -95,7 +96,8 @@ def _lines(ahead: Ahead) -> Iterator[str]:
 
     expected, size = ahead.forecast, ahead.size
     held_out = f", {len(size.held_out)} held out" if size.held_out else ""
-    yield f"sequence   {ahead.name}: {size.frames} frames, {len(size.fitted)} cameras fitted{held_out}; {ahead.preset}"
+    fitted = f"{counted(len(size.fitted), 'camera')} fitted{held_out}"
+    yield f"sequence   {ahead.name}: {counted(size.frames, 'frame')}, {fitted}; {ahead.preset}"
     least, most = (minutes_text(ahead.minutes * factor) for factor in (1 / TIME_WITHIN, TIME_WITHIN))
     yield f"time       {least} to {most}" if ahead.minutes else "time       none: all is there"
     yield f"memory     {size_text(expected.memory_bytes)} for the largest job"

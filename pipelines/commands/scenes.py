@@ -17,6 +17,7 @@ from pipelines.commands.frames import frames_of
 from pipelines.commands.terminal import print_facts, shown
 from pipelines.disk import size_text
 from pipelines.request import read_settings
+from pipelines.words import counted
 from tasks.artefacts.recipe import override
 from tasks.artefacts.store import find_stores
 
@@ -156,7 +157,7 @@ def _verify_lines(scene: Path, report: VerifyReport) -> Iterator[str]:
     if report.header:
         yield f"damaged    {report.header}"
     if report.bad:
-        yield f"{scene}: {len(report.bad)} of {report.frames} frames are damaged: {report.problem}"
+        yield f"{scene}: {len(report.bad)} of {counted(report.frames, 'frame')} are damaged: {report.problem}"
     else:
         yield f"{scene}: all {report.frames} frames decode to exactly what was written"
 
@@ -301,7 +302,7 @@ def _scores_text(facts: Mapping[str, Any]) -> str:
     for name, why in facts.get("doubtful_masks", {}).items():
         lines.append(f"masks of {name} are not used: {why}")
     what = "held out, never fitted" if facts["held_out"] else "not all held out"
-    lines.append(f"{facts['frames']} frames, {size_text(facts['bytes_per_frame'])} a frame; cameras {what}")
+    lines.append(f"{counted(facts['frames'], 'frame')}, {size_text(facts['bytes_per_frame'])} a frame; cameras {what}")
     return "\n".join(lines)
 
 

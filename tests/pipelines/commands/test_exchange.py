@@ -156,10 +156,28 @@ def test_parts_rows_and_light_are_chosen(scene, lit_scene, tmp_path, capsys):
     assert "left out" not in told
 
 
-def test_a_sequence_in_one_file_has_the_name_of_its_format(scene, tmp_path, capsys):
-    assert run("export", scene, "--frames", ":", "--format", "usd", "-o", tmp_path / "frames") == WRONG
-    assert "usd is one file, named .usdc or .usda or .usd, but not frames" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "name", "told"),
+    [
+        (
+            ["--frames", ":", "--format", "usd"],
+            "frames",
+            "usd is one file, named .usdc or .usda or .usd, but",
+        ),
+        (["--frame", "0", "--format", "spz"], "a.ply", "spz is one file, named .spz, but not a.ply"),
+        (["--frames", "0:2"], "a.ply", "several frames of ply are a folder of files, but a.ply names a file"),
+        (["--frame", "0"], "a.ksplat", "ksplat is read, but not written; choose one with --format: ply, "),
+    ],
+)
+def test_a_name_that_tells_something_else_is_refused(scene, tmp_path, capsys, words, name, told):
+    assert run("export", scene, *words, "-o", tmp_path / name) == WRONG
+    assert told in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_formats_that_share_a_suffix_are_told_by_name(scene, tmp_path):
+    for kind, name in (("spz3", "a.spz"), ("compressed-ply", "b.ply"), ("ply", "c.PLY")):
+        assert run("export", scene, "--frame", 0, "--format", kind, "-o", tmp_path / name) == OK
 
 
 def test_pictures_are_drawn_in_the_light_of_their_frame(scene, lit_scene, tmp_path):
