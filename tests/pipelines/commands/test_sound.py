@@ -47,6 +47,13 @@ def test_info_and_verify_tell_of_sound(loud, tmp_path, capsys):
     assert "sound" not in capsys.readouterr().out
 
 
+def test_an_export_says_what_becomes_of_the_sound(loud, tmp_path, capsys):
+    assert main(["export", str(loud), "--frames", "0:2", "-o", str(tmp_path / "frames")]) == 0
+    assert "sound      of cam1 is left out\n" in capsys.readouterr().out
+    assert main(["export", str(loud), "--frame", "0", "-o", str(tmp_path / "frame.ply")]) == 0
+    assert "sound" not in capsys.readouterr().out
+
+
 def test_a_compressed_scene_sounds_the_same(loud, tmp_path):
     assert main(["compress", str(loud), "--ratio", "1.3", "-o", str(tmp_path / "small.mkv")]) == 0
     with open_scene(loud) as whole, open_scene(tmp_path / "small.mkv") as small:
