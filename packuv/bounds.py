@@ -40,6 +40,8 @@ MOST_RATE_PART = 2**31 - 1
 """Numerator and denominator of a frame rate: FFmpeg's"""
 MOST_SAMPLE_RATE, MOST_SOUND_CHANNELS, MOST_SAMPLES = 655_350, 8, 2**36 - 1
 """Of sound: FLAC's"""
+MOST_SOUND_PACKETS = 2**19
+"""14 hours"""
 MOST_TEXT = 1000
 """Characters of a name"""
 MOST_JSON_BYTES = 24 << 20

@@ -226,6 +226,10 @@ class Reader:
                 raise ValueError(f"{path}: video track {number} must be FFV1; the file is damaged or no scene")
         self.codec_private = tuple(stream.codec_context.extradata or b"" for stream in self._container.streams.video)
         """Of each track: what its decoder needs"""
+        self.sound_private = b"".join(
+            stream.codec_context.extradata or b"" for stream in self._container.streams.audio[:1]
+        )
+        """The same of sound; empty where there is none"""
         self._packets: Iterator[av.Packet[Any]] = self._container.demux(*self._container.streams.video)
 
     def close(self) -> None:
@@ -248,9 +252,11 @@ class Reader:
         return found
 
     def packets(self) -> Iterator[tuple[int, FoundPacket]]:
-        """Number of the track and packet, all in the order of the file from where the reader is."""
-        numbers = {stream.index: number for number, stream in enumerate(self._container.streams.video)}
-        for packet in self._packets:
+        """Number of the track and packet, all in the order of the file from where the reader is; sound comes as one
+        track more."""
+        streams = (*self._container.streams.video, *self._container.streams.audio[:1])
+        numbers = {stream.index: number for number, stream in enumerate(streams)}
+        for packet in self._container.demux(*streams):
             if packet.size:
                 yield numbers[packet.stream.index], FoundPacket(bytes(packet), packet.pos or 0)
 

@@ -95,6 +95,20 @@ def test_no_bit_of_the_sound_flips_unheard_and_none_costs_a_frame(scene_file, tm
         assert "its sound is not what was written, which costs no frame" in report.header
 
 
+def test_sound_is_read_by_the_copy_or_by_the_files_structure(scene_file, tmp_path, monkeypatch):
+    path, _, sound = scene_file
+    content = path.read_bytes()
+    (tmp_path / "no_copy.mkv").write_bytes(content[:-1] + b"x")  # of the copy's magic
+    (tmp_path / "no_structure.mkv").write_bytes(bytes(300) + content[300:])
+    for name in ("no_copy", "no_structure"):
+        with open_scene(tmp_path / f"{name}.mkv") as scene:
+            assert scene.damage
+            assert scene.sound() == sound
+    monkeypatch.setattr("packuv.scene.sound.open_matroska", None)
+    with open_scene(path) as scene:
+        assert scene.sound() == sound
+
+
 @needs_ffmpeg
 def test_ffmpeg_hears_the_same_and_a_copy_without_sound_is_told(scene_file, tmp_path):
     path, _, sound = scene_file
