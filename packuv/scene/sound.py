@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,17 +64,23 @@ class Sound:
         return cls(camera, HEAD + info + b"".join(map(bytes, packets)))
 
     def samples(self, first: int = 0, count: int = MOST_SAMPLES) -> np.ndarray:
-        """float32 [2, n] at RATE, from one sample on so many, as far as there are any."""
+        """float32 [2, n] at RATE, from one sample on so many, as far as there are any; raises ValueError for no FLAC."""
         parts, begins, resampler = [np.zeros((2, 0), np.float32)], 0, av.AudioResampler("fltp", LAYOUT, RATE)
-        with av.open(io.BytesIO(self.flac), "r", format=CODEC) as container:
-            for frame in container.decode(audio=0):
-                for part in resampler.resample(frame):
-                    wanted = slice(max(0, first - begins), max(0, first + count - begins))
-                    parts.append(part.to_ndarray()[:, wanted].astype(np.float32))
-                    begins += part.samples
-                if begins >= first + count:
-                    break
+        for frame in self._frames():
+            for part in resampler.resample(frame):
+                wanted = slice(max(0, first - begins), max(0, first + count - begins))
+                parts.append(part.to_ndarray()[:, wanted].astype(np.float32))
+                begins += part.samples
+            if begins >= first + count:
+                break
         return np.concatenate(parts, axis=1)
+
+    def _frames(self) -> Iterator[av.AudioFrame]:
+        try:
+            with av.open(io.BytesIO(self.flac), "r", format=CODEC) as container:
+                yield from container.decode(audio=0)
+        except av.FFmpegError as error:
+            raise ValueError(f"what {self.camera} heard is no FLAC that can be decoded ({error.strerror})") from None
 
     @property
     def entry(self) -> SoundEntry:

@@ -45,6 +45,13 @@ def test_what_is_too_loud_is_cut_off():
     assert Sound.of("cam", np.full((2, 100), -3, np.float32)).samples().min() == -1
 
 
+def test_what_is_no_flac_is_told():
+    flac = bytearray(Sound.of("cam", noise(9000)).flac)
+    flac[len(HEAD) : len(HEAD) + 34] = bytes(34)
+    with pytest.raises(ValueError, match="what cam heard is no FLAC that can be decoded"):
+        Sound("cam", bytes(flac)).samples()
+
+
 def test_sound_and_frames_come_back(scene_file):
     path, _, sound = scene_file
     frames = frames_of(random_sequence(0, SHAPES))
