@@ -64,7 +64,7 @@ class Sound:
         return cls(camera, HEAD + info + b"".join(map(bytes, packets)))
 
     def samples(self, first: int = 0, count: int = MOST_SAMPLES) -> np.ndarray:
-        """float32 [2, n] at RATE, from one sample on so many, as far as there are any; raises ValueError for no FLAC."""
+        """float32 [2, n] at RATE, from one sample on so many, or as there are. Raises ValueError for no FLAC."""
         parts, begins, resampler = [np.zeros((2, 0), np.float32)], 0, av.AudioResampler("fltp", LAYOUT, RATE)
         for frame in self._frames():
             for part in resampler.resample(frame):

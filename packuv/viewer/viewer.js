@@ -224,7 +224,7 @@ async function fetchSound() {
 function hear() {
   const { voice } = sound, told = document.documentElement.dataset, now = scene.times_ns[player.frame] / 1e9 + player.due;
   const goesOn = player.playing && !player.stalled && !scrubbing && !filming.on && !document.hidden;
-  const asFilmed = player.speed === 1 && player.ends !== "bounce" && now < voice.duration - APART_SECONDS;
+  const asFilmed = player.speed === 1 && player.ends !== "bounce" && now < voice.duration - (voice.ended ? APART_SECONDS : 0);
   if (!goesOn || !asFilmed || !sound.on || !(navigator.userActivation?.hasBeenActive ?? true)) {
     voice.pause();
     delete told.apart;
