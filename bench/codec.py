@@ -35,6 +35,7 @@ import numpy as np
 
 from bench import command
 from bench.doors import MEASURED, USUAL, Pictures, measure_doors
+from bench.entropy import channel_bits
 from bench.made_up import CAMERA, NEAR, SequenceOptions, find_gaussians, make_sequence
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer
 from packuv.gaussians.segment import Segment
@@ -281,15 +282,6 @@ def _decoded(codec: Codec, coded: tuple[list[bytes], bytes | None], shape: tuple
     return [frame.to_ndarray()[:height, :width] for frame in frames]
 
 
-def key_entropy(segment: Segment) -> dict[str, float]:
-    """Order-0 entropy of each channel of the key, bits: what a codec without context would pay."""
-    rows, bits = key_rows(segment.key), {}
-    for channel, name in enumerate(channel_names(round(((rows.shape[1] - 13) / 3) ** 0.5) - 1)):
-        share = np.bincount(rows[:, channel], minlength=256) / len(rows)
-        bits[name] = round(float(-(share[share > 0] * np.log2(share[share > 0])).sum()), 3)
-    return bits
-
-
 # Command
 
 
@@ -355,6 +347,7 @@ def run(options: argparse.Namespace, words: Sequence[str], folder: Path) -> dict
             with open_scene(file) as scene:
                 row["psnr_to_lossless_db"] = pictures.psnr(scene.gaussians)
         rows += measure_doors(lossless, options.formats, pictures, folder)
+        bits = channel_bits(lossless.segment(0))
     if least_bits is not None:
         rows.append(_floor(rows[0], least_bits))
     first = Segment.load(paths[0])
@@ -365,7 +358,7 @@ def run(options: argparse.Namespace, words: Sequence[str], folder: Path) -> dict
         "gaussians": len(first.key),
         "dynamic": int(first.dynamic.sum()),
         "rows": rows,
-        "key_entropy_bits": key_entropy(first),
+        "channel_bits": bits,
     }
 
 
