@@ -1,14 +1,18 @@
-"""Size, speed and distortion of the scene file, beside plain FFV1 of the whole atlas and beside other codecs.
+"""Size, speed and distortion of the scene file, beside other codecs and the formats of other programs.
 
-    python -m bench.codec --scene SCENE.mkv --capture CAPTURE --out bench/results/codec.json --plot rate.svg
-    python -m bench.codec --frames 30 --keyframes 4 --out runs/codec.json          # a made-up sequence
-    python -m bench.codec --segments S0.npz S1.npz --quantizer quantizer.json --out runs/codec.json
+    packuv bench codec --scene SCENE.mkv --capture CAPTURE --out bench/results/codec.json --plot rate.svg
+    packuv bench codec --frames 30 --keyframes 4 --out runs/codec.json          # a made-up sequence
+    packuv bench codec --segments S0.npz S1.npz --quantizer quantizer.json --out runs/codec.json
 
-`compact` rows are scene files, lossless and at each quality, written, verified and read. `plain atlas` rows code every
-byte plane of the whole 2048 x 1024 atlas in every frame, as the paper does, and `pictures` rows code the compact file's
-own pictures with other codecs, which must give back every byte. Distortion is the PSNR of renders from cameras that
-were not fitted against renders of the lossless scene and, with --capture, against what those cameras filmed. Wall time
-on a shared machine is noisy: compare rows of one run, and CPU seconds, which count all threads.
+`compact` rows are scene files, lossless and at each quality, written, verified and read. `plain atlas` codes every
+byte plane of the whole 2048 x 1024 atlas in every frame, as the paper does; `codes` rows the bytes of all Gaussians in
+every frame, in the order and mosaic of the scene file but without its differences between frames; `pictures` rows the
+compact file's own pictures; these must give back every byte. Rows named as a format are what `packuv export` writes,
+read again: a file a frame, of which the frames that are drawn are measured, or all frames in one. Distortion is the
+PSNR of renders from cameras that were not fitted against renders of the lossless scene and, with --capture, against
+what those cameras filmed. Noise of a made-up sequence is known, so its last row says what no codec is below that keeps
+the keys as they are. Wall time on a shared machine is noisy: compare rows of one run, and CPU seconds, which count
+all threads.
 """
 
 from __future__ import annotations
@@ -30,16 +34,18 @@ import av
 import numpy as np
 
 from bench import command
-from bench.made_up import SequenceOptions, find_gaussians, make_sequence
+from bench.doors import MEASURED, USUAL, Pictures, measure_doors
+from bench.entropy import channel_bits
+from bench.made_up import CAMERA, NEAR, SequenceOptions, find_gaussians, make_sequence
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer
 from packuv.gaussians.segment import Segment
-from packuv.gaussians.uvmap import assign_slots, atlas_pixels, atlas_size
+from packuv.gaussians.uvmap import Slots, assign_slots, atlas_pixels, atlas_size
 from packuv.gaussians.uvsize import UvOptions
+from packuv.interchange import SplatFormat
 from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, SceneHeader, open_scene, write_scene
 from packuv.scene.header import DYNAMIC, KEY
-from packuv.scene.matroska import Encoder, VideoTrack
+from packuv.scene.mosaic import Mosaic
 from packuv.scene.stream import channel_names, key_rows
-from packuv.score import Artist, spread
 from packuv.threads import ordinary_schedule
 from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
 
@@ -62,6 +68,8 @@ CODECS = {
     "vp9": Codec("libvpx-vp9", "yuv420p", (("lossless", "1"), ("cpu-used", "4"))),
     "av1": Codec("libsvtav1", "yuv420p", (("svtav1-params", "lossless=1"), ("preset", "8"))),
 }
+ALONE = ("ffv1", "hevc")
+"""Of these, those that also code the codes themselves: one that knows no other frame, and one that finds its own"""
 
 
 # The scene file
@@ -98,6 +106,7 @@ def measure_scene(
         own = [segment.own for segment in scene.index.segments]
     return {
         "layout": label,
+        "exact": options.tolerance.exact,
         "tolerance": vars(options.tolerance),
         "bytes": summary.bytes,
         "track_bytes": dict(summary.track_bytes),
@@ -107,12 +116,12 @@ def measure_scene(
         "bits_per_gaussian_and_frame": summary.bytes * 8 / sum(rows),
         "key_rows_stored": own,
         "frames_by_prediction": {name: predictions.count(k) for k, name in enumerate(("repeat", "previous", "linear"))},
-        "encode_frames_per_second": frames / encoded[0],
+        "encode_seconds_per_frame": encoded[0] / frames,
         "encode_cpu_seconds_per_frame": encoded[1] / frames,
-        "encode_and_verify_frames_per_second": frames / written,
-        "decode_codes_frames_per_second": frames / seconds_codes,
-        "decode_floats_frames_per_second": frames / seconds_floats,
-        "decode_floats_cpu_seconds_per_frame": cpu / frames,
+        "encode_and_verify_seconds_per_frame": written / frames,
+        "decode_codes_seconds_per_frame": seconds_codes / frames,
+        "decode_seconds_per_frame": seconds_floats / frames,
+        "decode_cpu_seconds_per_frame": cpu / frames,
         "random_access_seconds": seconds_random,
     }
 
@@ -133,46 +142,36 @@ def _seconds(work: Any) -> float:
 # The paper's pictures
 
 
-def measure_plain_atlas(
-    segments: Sequence[Path], quantizer: Quantizer, *, threads: int, frames_measured: int
-) -> dict[str, Any]:
+def measure_plain_atlas(segments: Sequence[Path], quantizer: Quantizer, *, frames_measured: int) -> dict[str, Any]:
     """FFV1 of every plane of the whole 2048 x 1024 atlas in every frame, absolute values, zero-filled (the paper).
 
     Frames cost nearly the same, so a few are encoded and the rest is extrapolated.
     """
-    options = UvOptions()
-    height, width = atlas_size(options)
-    channels = len(channel_names(quantizer.sh_degree))
-    across = int(np.ceil(np.sqrt(channels)))
-    down = -(-channels // across)
-    encoder = Encoder(VideoTrack("atlas", width * across, height * down, across * down))
-    total, seconds = 0, 0.0
-    sizes: list[int] = []
-    rows: list[int] = []
+    pictures: list[np.ndarray] = []
+    rows = total = 0
     for path in segments:
         segment = Segment.load(path)
         total += len(segment)
         floats = quantizer.decode(segment.key)
-        slots = assign_slots(floats.means, segment.key.attributes[:, OPACITY], quantizer.centre, options=options)
-        y, x = atlas_pixels(slots, options=options)[slots.kept].T
-        for step in range(min(len(segment), max(0, frames_measured - len(sizes)))):
-            picture = np.zeros((down, height, across, width), np.uint8)
-            rows_of_frame = _bytes(segment.frame(step))[slots.kept]
-            for channel in range(channels):
-                picture[channel // across, y, channel % across, x] = rows_of_frame[:, channel]
-            start = time.perf_counter()
-            sizes.append(len(encoder.encode(picture.reshape(down * height, across * width))))
-            seconds += time.perf_counter() - start
-            rows.append(int(slots.kept.sum()))
-    return {
-        "layout": "plain atlas, ffv1",
-        "bytes": round(np.mean(sizes) * total),
-        "frames": total,
-        "frames_measured": len(sizes),
-        "gaussians_per_frame": float(np.mean(rows)),
-        "bits_per_gaussian_and_frame": sum(sizes) * 8 / sum(rows),
-        "encode_frames_per_second": len(sizes) / seconds,
-    }
+        slots = assign_slots(floats.means, segment.key.attributes[:, OPACITY], quantizer.centre, options=UvOptions())
+        for step in range(min(len(segment), frames_measured - len(pictures))):
+            pictures.append(_atlas(_bytes(segment.frame(step)), slots))
+            rows += int(slots.kept.sum())
+    measured = _through("plain atlas, ffv1", CODECS["ffv1"], [pictures], len(pictures), rows)
+    size = round(measured["bytes"] / len(pictures) * total)
+    return {**measured, "bytes": size, "frames": total, "gaussians_per_frame": rows / len(pictures)}
+
+
+def _atlas(rows: np.ndarray, slots: Slots) -> np.ndarray:
+    """The atlas planes of rows uint8 [n, channels], about square, in one picture."""
+    height, width = atlas_size(UvOptions())
+    across = int(np.ceil(np.sqrt(rows.shape[1])))
+    down = -(-rows.shape[1] // across)
+    y, x = atlas_pixels(slots, options=UvOptions())[slots.kept].T
+    picture = np.zeros((down, height, across, width), np.uint8)
+    for channel, values in enumerate(rows[slots.kept].T):
+        picture[channel // across, y, channel % across, x] = values
+    return picture.reshape(down * height, across * width)
 
 
 def _bytes(codes: Codes) -> np.ndarray:
@@ -184,31 +183,56 @@ def _bytes(codes: Codes) -> np.ndarray:
 
 
 def measure_codecs(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """The pictures of both tracks of a scene file through other codecs, each track as one video."""
+    """The pictures of both tracks of a scene file through other codecs, each track as one video; and its codes."""
     with open_scene(path) as scene:
         tracks = [list(_pictures(scene, number)) for number in range(len(scene.index.tracks))]
+        codes = list(_undifferenced(scene))
         rows = sum(segment.rows * segment.frames for segment in scene.index.segments)
-        frames = len(scene)
     for name in names:
-        codec, start = CODECS[name], time.perf_counter()
-        try:
-            coded = [_code(codec, pictures) for pictures in tracks]
-        except (av.FFmpegError, ValueError) as error:
-            yield {"layout": f"pictures, {name}", "skipped": str(error)}
-            continue
-        seconds = time.perf_counter() - start
-        exact = all(_comes_back(codec, *pair) for pair in zip(coded, tracks, strict=True))
-        size = sum(len(packet) for packets, _ in coded for packet in packets)
-        yield {
-            "layout": f"pictures, {name}",
-            "exact": exact,
-            "bytes": size,
-            "track_bytes": [sum(map(len, packets)) for packets, _ in coded],
-            "frames": frames,
-            "frames_measured": frames,
-            "bits_per_gaussian_and_frame": size * 8 / rows,
-            "encode_frames_per_second": frames / seconds,
-        }
+        yield _through(f"pictures, {name}", CODECS[name], tracks, len(codes), rows)
+    for name in names:
+        if name in ALONE:
+            yield _through(f"codes, {name}", CODECS[name], [codes], len(codes), rows)
+
+
+def _through(
+    label: str, codec: Codec, tracks: Sequence[Sequence[np.ndarray]], frames: int, rows: int
+) -> dict[str, Any]:
+    """Videos of so many frames, with so many rows in all of them, coded and decoded."""
+    start = time.perf_counter()
+    try:
+        coded = [_code(codec, pictures) for pictures in tracks]
+    except (av.FFmpegError, ValueError) as error:
+        return {"layout": label, "skipped": str(error)}
+    written = time.perf_counter()
+    shapes = [pictures[0].shape for pictures in tracks]
+    found = [_decoded(codec, *pair) for pair in zip(coded, shapes, strict=True)]
+    read = time.perf_counter()
+    size = sum(len(packet) for packets, _ in coded for packet in packets)
+    return {
+        "layout": label,
+        "exact": all(map(_same, found, tracks)),
+        "bytes": size,
+        "track_bytes": [sum(map(len, packets)) for packets, _ in coded],
+        "frames": frames,
+        "frames_measured": frames,
+        "bits_per_gaussian_and_frame": size * 8 / rows,
+        "encode_seconds_per_frame": (written - start) / frames,
+        "decode_seconds_per_frame": (read - written) / frames,
+    }
+
+
+def _same(found: Sequence[np.ndarray], pictures: Sequence[np.ndarray]) -> bool:
+    return len(found) == len(pictures) and all(map(np.array_equal, found, pictures))
+
+
+def _undifferenced(scene: Scene) -> Iterator[np.ndarray]:
+    """A picture of each frame as if it were a key: all its rows, as they are."""
+    channels = len(channel_names(scene.header.quantizer.sh_degree))
+    most = max(segment.rows for segment in scene.index.segments)
+    mosaic = Mosaic.of(most, tuple(range(channels)), channels)
+    for frame in range(len(scene)):
+        yield mosaic.draw(key_rows(scene.codes(frame)))
 
 
 def _pictures(scene: Scene, track: int) -> Iterator[np.ndarray]:
@@ -244,51 +268,18 @@ def _framed(picture: np.ndarray, pixels: str) -> np.ndarray:
     return np.concatenate([picture, np.full((picture.shape[0] // 2, picture.shape[1]), 128, np.uint8)])
 
 
-def _comes_back(codec: Codec, coded: tuple[list[bytes], bytes | None], pictures: Sequence[np.ndarray]) -> bool:
+def _decoded(codec: Codec, coded: tuple[list[bytes], bytes | None], shape: tuple[int, ...]) -> list[np.ndarray]:
+    """The pictures of packets, uint8 [height, width] each."""
     packets, header = coded
     encoder = av.CodecContext.create(codec.encoder, "w").codec
     names = {"libx264": "h264", "libx265": "hevc", "libvpx-vp9": "vp9", "libsvtav1": "libdav1d"}
     context = av.CodecContext.create(names.get(codec.encoder, encoder.name), "r")
     assert isinstance(context, av.VideoCodecContext)
     context.extradata = header
-    context.height, context.width = pictures[0].shape
+    context.height, context.width = height, width = shape
     frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
     frames += context.decode(None)
-    height, width = pictures[0].shape
-    found = [frame.to_ndarray()[:height, :width] for frame in frames]
-    return len(found) == len(pictures) and all(map(np.array_equal, found, pictures))
-
-
-# Distortion
-
-
-def measure_renders(lossless: Path, scenes: Sequence[Path], *, frames: int) -> list[float]:
-    """PSNR of each scene's renders against the lossless scene's, decibels, over frames and cameras together."""
-    squares = np.zeros(len(scenes))
-    count = 0
-    with open_scene(lossless) as truth:
-        artist, header = Artist(truth), truth.header
-        names = header.held_out or spread([camera.name for camera in header.cameras], 3)
-        cameras = [camera for camera in header.cameras if camera.name in names]
-        chosen = [(2 * place + 1) * len(truth) // (2 * frames) for place in range(min(frames, len(truth)))]
-        for frame in chosen:
-            expected = [artist.draw(truth.gaussians(frame), camera) for camera in cameras]
-            count += sum(picture.size for picture in expected)
-            for number, path in enumerate(scenes):
-                with open_scene(path) as scene:
-                    gaussians = scene.gaussians(frame)
-                for camera, picture in zip(cameras, expected, strict=True):
-                    squares[number] += float(((artist.draw(gaussians, camera) - picture) ** 2).sum())
-    return [float(10 * np.log10(count / max(square, 1e-12))) for square in squares]
-
-
-def key_entropy(segment: Segment) -> dict[str, float]:
-    """Order-0 entropy of each channel of the key, bits: what a codec without context would pay."""
-    rows, bits = key_rows(segment.key), {}
-    for channel, name in enumerate(channel_names(round(((rows.shape[1] - 13) / 3) ** 0.5) - 1)):
-        share = np.bincount(rows[:, channel], minlength=256) / len(rows)
-        bits[name] = round(float(-(share[share > 0] * np.log2(share[share > 0])).sum()), 3)
-    return bits
+    return [frame.to_ndarray()[:height, :width] for frame in frames]
 
 
 # Command
@@ -306,6 +297,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--plain-frames", type=int, default=2, help="frames of plain atlas FFV1 to measure")
     parser.add_argument("--render-frames", type=int, default=4, help="frames to render for distortion")
     parser.add_argument("--codecs", nargs="*", default=list(CODECS), choices=list(CODECS))
+    parser.add_argument(
+        "--formats", nargs="*", type=SplatFormat, default=list(USUAL), choices=list(MEASURED), help="of other programs"
+    )
     for name, default in asdict(SequenceOptions()).items():
         parser.add_argument(f"--{name}", type=type(default), default=default, help="of the made-up sequence")
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -325,7 +319,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str], folder: Path) -> dict[str, Any]:
     """All measurements of one command line."""
-    paths, header, source = _sequence(options, folder)
+    paths, header, source, least_bits = _sequence(options, folder)
     rows = [
         measure_scene(
             f"compact, {quality}",
@@ -341,47 +335,65 @@ def run(options: argparse.Namespace, words: Sequence[str], folder: Path) -> dict
     if len(paths) > 1:
         alone, file = EncodeOptions(reach=1), folder / "alone.mkv"
         rows.append(measure_scene("compact, no sharing", paths, header, file, alone, threads=options.threads))
-    if header.cameras:
-        for row, decibel in zip(
-            rows[1:], measure_renders(files[0], files[1:], frames=options.render_frames), strict=False
-        ):
-            row["psnr_to_lossless_db"] = decibel
     if options.capture:
         for row, path in zip(rows, files, strict=False):
             row["unseen_cameras"] = _filmed(path, options.capture)
     if options.plain_frames:
-        plain = measure_plain_atlas(
-            paths, header.quantizer, threads=options.threads, frames_measured=options.plain_frames
-        )
-        rows.append(plain)
+        rows.append(measure_plain_atlas(paths, header.quantizer, frames_measured=options.plain_frames))
     rows += measure_codecs(files[0], options.codecs)
+    with open_scene(files[0]) as lossless:
+        pictures = Pictures(lossless, frames=options.render_frames)
+        for row, file in zip(rows[1:], files[1:], strict=False):
+            with open_scene(file) as scene:
+                row["psnr_to_lossless_db"] = pictures.psnr(scene.gaussians)
+        rows += measure_doors(lossless, options.formats, pictures, folder)
+        bits = channel_bits(lossless.segment(0))
+    if least_bits is not None:
+        rows.append(_floor(rows[0], least_bits))
     first = Segment.load(paths[0])
     return {
         "source": source,
-        "command": shlex.join(["python", "-m", "bench.codec", *words]),
+        "command": shlex.join(["packuv", "bench", "codec", *words]),
         "load": os.getloadavg()[0],
         "gaussians": len(first.key),
         "dynamic": int(first.dynamic.sum()),
         "rows": rows,
-        "key_entropy_bits": key_entropy(first),
+        "channel_bits": bits,
     }
 
 
-def _sequence(options: argparse.Namespace, folder: Path) -> tuple[list[Path], SceneHeader, Any]:
-    """Segment files, what the scene says, and where it is from."""
+def _floor(lossless: dict[str, Any], least_bits: float) -> dict[str, Any]:
+    """The row of a file with the keys of a lossless one and nothing but noise besides."""
+    size = lossless["track_bytes"]["key"] + least_bits / 8
+    bits = lossless["bits_per_gaussian_and_frame"] * size / lossless["bytes"]
+    return {
+        "layout": "keys, and noise alone",
+        "exact": True,
+        "bytes": round(size),
+        "frames": lossless["frames"],
+        "bits_per_gaussian_and_frame": bits,
+    }
+
+
+def _sequence(options: argparse.Namespace, folder: Path) -> tuple[list[Path], SceneHeader, Any, float | None]:
+    """Segment files, what the scene says, where it is from, and the least bits of its frames after keys if known."""
     if options.scene:
-        return _unpacked(options.scene, folder)
+        return *_unpacked(options.scene, folder), None
     source: Any
+    least_bits = None
     if options.segments:
         paths, source = options.segments, "segment files"
         quantizer = Quantizer.from_json(json.loads(options.quantizer.read_text()))
     else:
         made_up = SequenceOptions(**{name: getattr(options, name) for name in asdict(SequenceOptions())})
         gaussians, origin = find_gaussians(made_up.seed)
-        segments, quantizer = make_sequence(gaussians, made_up)
+        segments, quantizer, least_bits = make_sequence(gaussians, made_up)
         paths, source = _saved(segments, folder), {"made up from": origin, **asdict(made_up)}
     frames = sum(len(Segment.load(path)) for path in paths)
-    return paths, SceneHeader(quantizer, (np.arange(frames) * 10**9 // 30).astype(np.int64), Fraction(30)), source
+    times = (np.arange(frames) * 10**9 // 30).astype(np.int64)
+    if options.segments:
+        return paths, SceneHeader(quantizer, times, Fraction(30)), source, least_bits
+    return paths, SceneHeader(quantizer, times, Fraction(30), (CAMERA,), extra={"near": NEAR}), source, least_bits
 
 
 def _unpacked(path: Path, folder: Path) -> tuple[list[Path], SceneHeader, Any]:
@@ -407,22 +419,27 @@ def _filmed(path: Path, capture: Path) -> dict[str, float]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """One line a layout."""
+    """One line a layout, as Markdown."""
     lines = [
-        f"{'layout':22} {'MB/30 frames':>12} {'bits/G/frame':>12} {'encode f/s':>10} {'decode f/s':>10} {'PSNR':>6}"
+        "| layout | kB a frame | bits per Gaussian and frame | encode, s | decode, s a frame | to lossless, dB |",
+        "|---|---|---|---|---|---|",
     ]
     for row in rows:
         if "skipped" in row:
-            lines.append(f"{row['layout']:22} skipped: {row['skipped']}")
+            lines.append(f"| {row['layout']} | not measured: {row['skipped']} | | | | |")
             continue
-        size = row["bytes"] * 30 / row["frames"] / 1e6
-        known = [size, row["bits_per_gaussian_and_frame"], row["encode_frames_per_second"]]
-        known += [row.get("decode_floats_frames_per_second", np.nan)]
-        known += [1e3 * row.get(f"{way}_cpu_seconds_per_frame", np.nan) for way in ("encode", "decode_floats")]
-        known += [row.get("psnr_to_lossless_db", np.nan)]
-        exact = "" if row.get("exact", True) else "  NOT EXACT"
-        lines.append(f"{row['layout']:22} " + " ".join(f"{value:13.2f}" for value in known) + exact)
+        figures = [f"{row['bytes'] / row['frames'] / 1e3:.1f}", f"{row['bits_per_gaussian_and_frame']:.2f}"]
+        seconds = (row.get(f"{way}_seconds_per_frame") for way in ("encode", "decode"))
+        figures += ["" if each is None else f"{each:.3f}" for each in seconds]
+        lines.append(f"| {' | '.join([row['layout'], *figures, _loss(row)])} |")
     return "\n".join(lines)
+
+
+def _loss(row: dict[str, Any]) -> str:
+    if row["exact"]:
+        return "exact"
+    decibel = row.get("psnr_to_lossless_db")
+    return "NOT EXACT" if decibel is None else f"{decibel:.2f}"
 
 
 def plot(rows: Sequence[dict[str, Any]]) -> str:

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.floor import noise_bits
+from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, ROTATION, Quantizer, attribute_values
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
@@ -21,6 +23,12 @@ from packuv.gaussians.uvsize import UvOptions
 from packuv.interchange import read_ply
 
 DATA = Path(os.environ.get("PACKUV_DATA", Path(__file__).parents[1] / "../shared/data"))
+CAMERA = PinholeCamera(
+    "front", 640, 360, 500.0, 500.0, 320.0, 180.0, np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 3], [0, 0, 0, 1]])
+)
+"""One that looks at the actor from 3 m, z up in the world"""
+NEAR = 0.1
+"""Before which it sees nothing, m"""
 
 
 @dataclass(frozen=True)
@@ -130,11 +138,17 @@ class _FitNoise:
     def __init__(self, g: Gaussians, strength: float, rng: np.random.Generator) -> None:
         self._rng, size = rng, np.exp(g.log_scales.mean(axis=1, keepdims=True))
         self._sigma = [strength * s for s in (0.05 * size, 0.03, 0.01, 0.10, 0.02)]
-        self._state = [np.zeros_like(a) for a in _arrays(g)]
+        self._state = self._foretold = [np.zeros_like(a) for a in _arrays(g)]
 
     def step(self) -> None:
         draws = (sigma * self._rng.standard_normal(s.shape) for s, sigma in zip(self._state, self._sigma, strict=True))
+        self._foretold = [0.9 * s for s in self._state]
         self._state = [0.9 * s + draw for s, draw in zip(self._state, draws, strict=True)]
+
+    def least_bits(self, g: Gaussians, quantizer: Quantizer) -> np.ndarray:
+        """Of the codes of `on(g)`, [n], for one who knows g and the noise before the last step, not only its codes."""
+        expected = Gaussians(*(a + s for a, s in zip(_arrays(g), self._foretold, strict=True)))
+        return noise_bits(expected, self._sigma, quantizer)
 
     def on(self, g: Gaussians) -> Gaussians:
         noisy = Gaussians(*(a + s for a, s in zip(_arrays(g), self._state, strict=True)))
@@ -145,25 +159,27 @@ def _arrays(g: Gaussians) -> tuple[np.ndarray, ...]:
     return g.means, g.log_scales, g.quaternions, g.opacity_logits, g.sh
 
 
-def make_sequence(source: Gaussians, options: SequenceOptions) -> tuple[list[Segment], Quantizer]:
-    """Segments of one made-up sequence, pruned by the UV map at each key, and their quantizer.
+def make_sequence(source: Gaussians, options: SequenceOptions) -> tuple[list[Segment], Quantizer, float]:
+    """Segments of one made-up sequence, pruned by the UV map at each key, their quantizer, and the least bits.
 
-    What no segment touched keeps its codes from key to key, as in a fit; the actor is fitted anew at each.
+    What no segment touched keeps its codes from key to key, as in a fit; the actor is fitted anew at each. The least
+    bits are those of the noise in all frames but the keys: no code of these frames is smaller on average.
     """
     rng = np.random.default_rng(options.seed)
     around = _surroundings(source, options.still, rng)
     actor = _placed(_pick(source, rng.permutation(len(source))[: options.actor]), 1.8, np.zeros(3))
     quantizer = _quantizer(_join([around, _posed(actor, 0)]))
     azimuth = np.arctan2(around.means[:, 1], around.means[:, 0])
-    segments = []
+    segments, least_bits = [], 0.0
     for number in range(options.keyframes):
         away = np.abs(np.angle(np.exp(1j * (azimuth - 0.5 - 0.15 * number))))
         near = np.argsort(away, kind="stable")[: options.restless]
-        segment, touched = _segment(number * options.frames, around, near, actor, quantizer, options, rng)
+        segment, touched, bits = _segment(number * options.frames, around, near, actor, quantizer, options, rng)
         segments.append(segment)
+        least_bits += bits
         for old, new in zip(_arrays(around), _arrays(touched), strict=True):
             old[near] = new
-    return segments, quantizer
+    return segments, quantizer, least_bits
 
 
 def _segment(
@@ -174,8 +190,8 @@ def _segment(
     quantizer: Quantizer,
     options: SequenceOptions,
     rng: np.random.Generator,
-) -> tuple[Segment, Gaussians]:
-    """A segment, and what the surroundings that it touched are in the end."""
+) -> tuple[Segment, Gaussians, float]:
+    """A segment, what the surroundings that it touched are in the end, and the least bits of its frames."""
     restless = _pick(around, near)
     moving = _join([restless, _posed(actor, first / 30)])
     noise = _FitNoise(moving, options.noise, rng)
@@ -186,16 +202,18 @@ def _segment(
     dynamic = np.isin(np.arange(len(key)), near) | (np.arange(len(key)) >= len(around))
     place = np.concatenate([np.argsort(np.argsort(near)), np.arange(len(restless), len(moving))])
     order = np.argsort(place, kind="stable")  # rows of `moving` in the order of the key
-    last, frames = moving, []
+    last, frames, least_bits = moving, [], 0.0
     for frame in range(first + 1, first + options.frames):
         noise.step()
-        last = noise.on(_join([restless, _posed(actor, frame / 30)]))
+        moved = _join([restless, _posed(actor, frame / 30)])
+        last = noise.on(moved)
         frames.append(quantizer.encode(_pick(last, order))[kept[dynamic]])
+        least_bits += float(noise.least_bits(moved, quantizer)[order][kept[dynamic]].sum())
     count = int((dynamic & kept).sum())
     xyz = np.array([f.xyz for f in frames], np.uint16).reshape(-1, count, 3)
     attributes = np.array([f.attributes for f in frames], np.uint8).reshape(len(frames), count, -1)
     segment = Segment(first, quantizer.encode(key)[kept], dynamic[kept], xyz, attributes)
-    return segment, _pick(last, np.arange(len(restless)))
+    return segment, _pick(last, np.arange(len(restless))), least_bits
 
 
 def _quantizer(key: Gaussians) -> Quantizer:

@@ -38,6 +38,10 @@ MOST_LIGHT = 10.0
 """Absolute value of the natural logarithm of light: 22,000 times as much as in steady light, or as little"""
 MOST_RATE_PART = 2**31 - 1
 """Numerator and denominator of a frame rate: FFmpeg's"""
+MOST_SAMPLE_RATE, MOST_SOUND_CHANNELS, MOST_SAMPLES = 655_350, 8, 2**36 - 1
+"""Of sound: FLAC's"""
+MOST_SOUND_PACKETS = 2**19
+"""14 hours"""
 MOST_TEXT = 1000
 """Characters of a name"""
 MOST_JSON_BYTES = 24 << 20

@@ -23,6 +23,7 @@ from packuv.colour import lit
 from packuv.files import load_json, whole_file
 from packuv.progress import Progress
 from packuv.scene import Scene
+from packuv.scene.sound import RATE
 from packuv.score import Artist, as_pixels
 
 FORMAT, VERSION = "packuv-path", 1
@@ -30,8 +31,8 @@ MOST_VIEWS, MOST_SECONDS = 1000, 3600.0
 CODING = {"crf": "16", "preset": "medium", "x264-params": "threads=1:sliced-threads=0:cpu-independent=1"}
 """Of x264; one thread, for its output depends on their number, and no choice of code by the processor, for its
 macroblock tree for AVX-512 reads memory that nobody wrote"""
-SOUND_RATE = 48_000
-"""Samples a second of a film's sound"""
+SOUND_RATE = RATE
+"""Samples a second of a film's sound: as of a scene's"""
 PACE = 0.02
 """Share by which frames may pass faster or slower than they were filmed, for their sound to be heard; and one frame"""
 

@@ -592,7 +592,7 @@ def _film(command: argparse.ArgumentParser) -> None:
     command.add_argument("--size", type=_size, default=None, metavar="WxH", help="picture size, pixels (first view's)")
     command.add_argument("--fps", type=_rate, default=None, metavar="N", help="pictures per second (the scene's)")
     command.add_argument(
-        "--capture", type=Path, metavar="DIR", help="have its sound go along (the run's, where it is known)"
+        "--capture", type=Path, metavar="DIR", help="have its sound go along (the scene's, or else the run's)"
     )
     command.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="what renders")
     _output(command, "FILE.mp4", "the film")

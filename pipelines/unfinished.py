@@ -131,6 +131,7 @@ class Unfinished:
         self.quantizer, self.rate, self.near, self.up = key.quantizer, header.rate, key.bounds.near, header.up
         self.cameras, self.held_out = header.cameras, frozenset(held_out)
         self.metric: bool = header.extra["metric"]
+        self.heard = ""  # sound goes on where frames have gaps
         self.light = header.light[instants]
         self.times_ns = np.array([int(frame * 10**9 / header.rate) for frame in range(len(instants))], np.int64)
         self.segments = tuple(range(end - part.frames, end) for end, part in zip(ends, parts, strict=True))
@@ -146,6 +147,9 @@ class Unfinished:
             return "the backdrop, before any keyframe"
         whole = sum(part.segment is not None and not part.under_way for part in self.parts)
         return f"{self.segments[-1].stop} frames of {len(self.parts)} segments, {whole} of them whole"
+
+    def sound(self) -> bytes:
+        return b""
 
     def key(self, segment: int) -> Codes:
         return self._part(segment).key

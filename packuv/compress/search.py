@@ -123,6 +123,7 @@ class _Work:
         self._ticks = Ticks(progress, len(learned) * len(self._judge.frames) + TRIALS + 1)
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, seed=seed, ticks=self._ticks)
         self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
+        self._sound = scene.sound()
         self._folder = Path()
         self._segments: list[Path] = []
 
@@ -198,7 +199,7 @@ class _Work:
         said = {**self._said(steps), **figures}
         extra = {**header.extra, COMPRESSION: said}
         stated = replace(header, quantizer=steps.quantizer(header.quantizer), extra=extra)
-        return write_scene(path, coarse, stated, options=options, threads=self._threads).bytes
+        return write_scene(path, coarse, stated, sound=self._sound, options=options, threads=self._threads).bytes
 
     def _said(self, steps: Steps) -> dict[str, Any]:
         """What the header says of how it was compressed, but for what was found."""

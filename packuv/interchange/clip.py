@@ -13,7 +13,8 @@ from packuv.colour import OFFSET, light_factors, linear_from_srgb, srgb_from_lin
 from packuv.gaussians.floats import SH_C0, Gaussians, drawn, lit_gaussians, opacity, rows_of
 from packuv.interchange.conventions import is_drawn
 from packuv.progress import Progress, no_progress
-from packuv.scene import Scene
+from packuv.scene import Scene, Sound
+from packuv.scene.sound import RATE
 
 ANTIALIASED = "antialiased"
 """Field of a header's `extra`: trained with the opacities of Mip-Splatting"""
@@ -93,6 +94,21 @@ class Clip:
         """When each frame was filmed, float64 [T], from the first one on."""
         times = self._scene.header.times_ns[self.frames.start : self.frames.stop]
         return np.asarray((times - times[:1]) / 1e9, np.float64)
+
+    @property
+    def heard(self) -> str:
+        """Name of the camera that heard the sound of the scene; empty where it has none."""
+        told = self._scene.index.sound
+        return told.camera if told else ""
+
+    def sound(self) -> Sound | None:
+        """What was heard from the first of the frames to the end of the last; None where that is nothing."""
+        whole = self._scene.sound()
+        if whole is None:
+            return None
+        start, seconds = self._scene.header.seconds_to(self.frames.start), float(self.seconds[-1] + 1 / self.rate)
+        samples = whole.samples(round(start * RATE), round(seconds * RATE))
+        return Sound.of(whole.camera, samples) if samples.size else None
 
     @property
     def gains(self) -> np.ndarray:

@@ -73,6 +73,8 @@ class Door:
     """Of a path and the Gaussians of a frame, with `keep_rows`: the number of drawn Gaussians in the file"""
     write_clip: Callable[[Path, Clip], int] | None = None
     """Of a path and frames: the number of drawn Gaussians in all of them"""
+    sounds: bool = False
+    """Whether it holds what was heard meanwhile, too"""
 
     @property
     def is_written(self) -> bool:
@@ -132,6 +134,7 @@ DOORS: dict[SplatFormat, Door] = {
         (".4dgs",),
         ".4dgs rounds to steps that its header declares, SH above band 0 to bytes over -4..4, and cuts colours to 0..1",
         write_clip=write_fourdgs,
+        sounds=True,
     ),
 }
 WRITTEN = tuple(kind for kind, door in DOORS.items() if door.is_written)

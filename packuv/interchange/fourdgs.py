@@ -2,7 +2,8 @@
 
 What stays the same from frame to frame is one Gaussian with a long window; what moves is another one in each frame, so
 that every frame is what the scene shows, and nothing is guessed between frames. The library rounds everything to steps
-that it declares; SH above band 0 are bytes over -4..4, and colours are cut to 0..1.
+that it declares; SH above band 0 are bytes over -4..4, and colours are cut to 0..1. Sound goes along as FLAC, from
+nowhere in particular.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from packuv.gaussians.floats import SH_C0, Gaussians, arrays, opacity, rows_of
 from packuv.interchange.clip import Clip
 from packuv.interchange.conventions import half_turn, is_drawn, unit
 from packuv.interchange.joined import equal_rows
+from packuv.scene.sound import LAYOUT, Sound
 
 SH_REACH = 4.0
 """Of the bytes of SH"""
@@ -38,10 +40,29 @@ def write_fourdgs(path: Path, clip: Clip) -> int:
     end = float(seconds[-1] + 1 / clip.rate)
     if not spans.count:
         raise ValueError("a .4dgs file holds a Gaussian at least, but these frames have none; choose PLY")
+    sources = _sources(library, clip.sound())
     options = library.WriteOptions(profile="fine", preserve_source_ids=True, library="packuv", metadata=SAID)
     with whole_file(path) as partial:
-        library.write(str(partial), spans.whole(library, end), end, options=options)
+        library.write(str(partial), spans.whole(library, end), end, options=options, audio_sources=sources)
     return spans.drawn
+
+
+def _sources(library: Any, sound: Sound | None) -> list[Any]:
+    """What is heard, as the library has it: stereo, the same wherever one looks."""
+    if sound is None:
+        return []
+    entry = sound.entry
+    return [
+        library.AudioSource(
+            source_id=0,
+            codec=entry.codec,
+            data=sound.flac,
+            name=sound.camera,
+            channel_layout=LAYOUT,
+            duration_sec=entry.seconds,
+            spatial=False,
+        )
+    ]
 
 
 def _library() -> Any:

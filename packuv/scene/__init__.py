@@ -13,6 +13,7 @@ rows that may change inside a segment come first.
 from packuv.scene.encoder import TOLERANCES, EncodeOptions, Quality
 from packuv.scene.header import SceneHeader
 from packuv.scene.reader import Scene, open_scene
+from packuv.scene.sound import Sound
 from packuv.scene.stream import Tolerance
 from packuv.scene.verify import VerifyReport, verify_scene
 from packuv.scene.writer import SceneSummary, write_scene
@@ -24,6 +25,7 @@ __all__ = [
     "Scene",
     "SceneHeader",
     "SceneSummary",
+    "Sound",
     "Tolerance",
     "VerifyReport",
     "open_scene",

@@ -58,6 +58,8 @@ class Copy:
     """Of each track's packets: where they begin in the file"""
     around: str
     """See `digest_around`; empty in files that were written without it"""
+    sound: tuple[bytes, tuple[tuple[int, int], ...]]
+    """What its decoder needs, and where its packets lie in the file, half-open spans; none without sound"""
     start: int
     """Where its element begins in the file"""
 
@@ -66,18 +68,21 @@ def append_copy(path: Path, header: bytes) -> None:
     """Add the copy of a header, the content of packuv.json, to a scene file that has none."""
     reader = Reader(path)
     try:
-        spans: list[list[tuple[int, int]]] = [[] for _ in reader.tracks]
+        spans: list[list[tuple[int, int]]] = [[] for _ in (*reader.tracks, "sound")]
         for track, found in reader.packets():
             spans[track].append(found.span(path))
-        private = [data.hex() for data in reader.codec_private]
+        private, heard = [data.hex() for data in reader.codec_private], reader.sound_private
     finally:
         reader.close()
+    sound = spans.pop()
     with path.open("r+b") as file:
         end = file.seek(0, os.SEEK_END)
         said = {
             "codec_private": private,
             "positions": [[first for first, _ in track] for track in spans],
             "around": digest_around(file, (span for track in spans for span in track), end),
+            # Absent where nothing is heard, so that such scenes keep their bytes.
+            **({"sound": {"codec_private": heard.hex(), "spans": sound}} if heard else {}),
         }
         element = _element(header, json.dumps(said, separators=(",", ":")).encode())
         _grow_segment(file, len(element))
@@ -171,8 +176,21 @@ def _decode(header: bytes, places: bytes, start: int) -> Copy:
         tuple(bytes.fromhex(bounds.words(text, "codec_private")) for text in private),
         tuple(tuple(bounds.wholes(track, "positions", most=start)) for track in tracks),
         bounds.words(said.get("around", ""), "around"),
+        _sound_of(said.get("sound"), start),
         start,
     )
+
+
+def _sound_of(said: object, start: int) -> tuple[bytes, tuple[tuple[int, int], ...]]:
+    if said is None:
+        return b"", ()
+    found = bounds.fields(said, "sound")
+    spans = bounds.items(bounds.field(found, "spans", "sound"), "sound: spans", most=bounds.MOST_SOUND_PACKETS)
+    ends = [bounds.wholes(span, "sound: spans", most=start, count=2) for span in spans]
+    if (flat := [at for span in ends for at in span]) != sorted(flat):
+        raise ValueError("spans of sound must follow one another")
+    private = bytes.fromhex(bounds.words(bounds.field(found, "codec_private", "sound"), "sound: codec_private"))
+    return private, tuple((first, stop) for first, stop in ends)
 
 
 def _unpacked(packed: bytes) -> bytes:

@@ -62,6 +62,8 @@ class EncodeOptions:
     reach: int = 3
     """Largest number of key pictures that a jump decodes; 1: every key holds all its rows. The keys of a made-up
     sequence of twelve segments took 44 MB with a reach of 1, 20 with 2, 16 with 3, 15.7 with 4"""
+    sound: bool = True
+    """Whether the sound of the capture goes along, where there is any"""
 
     def __post_init__(self) -> None:
         if self.reach < 1:

@@ -92,6 +92,15 @@ class SceneHeader:
         milliseconds: np.ndarray = (self.times_ns - self.times_ns[:1] + 500_000) // 1_000_000
         return milliseconds
 
+    def seconds_to(self, frame: int) -> float:
+        """From the first frame to another one."""
+        return int(self.times_ns[frame] - self.times_ns[0]) / 1e9
+
+    @property
+    def seconds(self) -> float:
+        """Of the whole scene, with its last frame."""
+        return self.seconds_to(-1) + float(1 / self.rate)
+
     @property
     def near(self) -> float:
         """Depth before which nothing is drawn, world; raises ValueError where the scene does not say."""
@@ -304,6 +313,44 @@ class TrackEntry:
         return mosaic
 
 
+@dataclass(frozen=True)
+class SoundEntry:
+    """What the sound of a scene must be."""
+
+    camera: str
+    """That heard it"""
+    codec: str
+    sample_rate: int
+    channels: int
+    samples: int
+    """Of each channel"""
+    sha256: str
+    """Of the FLAC file that the track's STREAMINFO and packets make"""
+
+    @property
+    def seconds(self) -> float:
+        return self.samples / self.sample_rate
+
+    @classmethod
+    def from_json(cls, data: object) -> SoundEntry:
+        found = {item.name: field_of(bounds.fields(data, "sound"), item.name, "sound") for item in fields(cls)}
+
+        def words(name: str) -> str:
+            return bounds.words(found[name], f"sound: {name}")
+
+        def count(name: str, least: int, most: int) -> int:
+            return bounds.whole(found[name], f"sound: {name}", least=least, most=most)
+
+        return cls(
+            words("camera"),
+            words("codec"),
+            count("sample_rate", 1, bounds.MOST_SAMPLE_RATE),
+            count("channels", 1, bounds.MOST_SOUND_CHANNELS),
+            count("samples", 0, bounds.MOST_SAMPLES),
+            words("sha256"),
+        )
+
+
 class HeaderDamageError(ValueError):
     """A header that is not the one that was written."""
 
@@ -322,6 +369,8 @@ class SceneIndex:
     """`codes_digest` of each frame's codes"""
     tools: Mapping[str, str]
     """Versions of the programs that wrote the file"""
+    sound: SoundEntry | None = None
+    """What the sound must be that goes along, if any does"""
 
     def __post_init__(self) -> None:
         frames = sum(segment.frames for segment in self.segments)
@@ -378,6 +427,8 @@ class SceneIndex:
             "segments": [vars(segment) for segment in self.segments],
             "digests": list(self.digests),
             "tools": dict(self.tools),
+            # Absent where nothing is heard, so that such scenes keep their bytes.
+            **({"sound": vars(self.sound)} if self.sound else {}),
             **self.header.to_json(),
         }
 
@@ -411,6 +462,7 @@ class SceneIndex:
                 bounds.words(name, "tools"): bounds.words(value, f"tools: {name}")
                 for name, value in bounds.fields(tools, "tools").items()
             },
+            SoundEntry.from_json(data["sound"]) if "sound" in data else None,
         )
 
     def encode(self) -> dict[str, tuple[str, bytes]]:

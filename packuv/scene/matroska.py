@@ -1,4 +1,4 @@
-"""FFV1 pictures and attachments in one Matroska file, through PyAV alone.
+"""FFV1 pictures, sound and attachments in one Matroska file, through PyAV alone.
 
 Every picture is intra-coded (g = 1), so any packet decodes by itself, and a packet's time is the time of the frame it
 belongs to, in milliseconds, Matroska's own clock in FFmpeg.
@@ -6,10 +6,13 @@ belongs to, in milliseconds, Matroska's own clock in FFmpeg.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from heapq import merge
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -38,7 +41,7 @@ class VideoTrack:
 
 @dataclass(frozen=True)
 class Packet:
-    """One coded picture."""
+    """One coded picture, or some sound."""
 
     track: int
     """Number of its track in the file"""
@@ -136,24 +139,39 @@ def write_matroska(
     attachments: Mapping[str, tuple[str, bytes]],
     *,
     rate: Fraction,
+    flac: bytes = b"",
 ) -> None:
     """Write packets, in order of time, and attachments (name -> MIME type, content); same input, same bytes.
 
-    The `bitexact` flag keeps dates, library versions and random identifiers out of the file.
+    `flac` is a file of sound that goes along as a track after the others. The `bitexact` flag keeps dates, library
+    versions and random identifiers out of the file.
     """
     options = {"fflags": "+bitexact", "max_interleave_delta": "1"}  # packets come in order: never hold them back
     with av.open(str(path), "w", format="matroska", options=options) as container:
-        streams = []
+        streams = list[Any]()
         for track in tracks:
             stream = container.add_stream("ffv1", rate=rate)
             _configure(stream.codec_context, track)
             stream.metadata["title"] = track.name
             stream.time_base = TIME_BASE
             streams.append(stream)
+        heard = list[Packet]()
+        if flac:
+            with av.open(io.BytesIO(flac), "r", format="flac") as source:
+                voice = source.streams.audio[0]
+                streams.append(container.add_stream_from_template(voice))
+                heard += (_heard(packet, len(tracks)) for packet in source.demux(voice) if packet.size)
         for name, (mime, content) in attachments.items():
             container.add_attachment(name, mime, content)
-        for packet in packets:
+        for packet in merge(packets, heard, key=attrgetter("time_ms")):
             container.mux(_muxable(packet, streams[packet.track]))
+
+
+def _heard(packet: av.Packet[av.AudioStream], track: int) -> Packet:
+    """A packet of sound, in the file's clock."""
+    times = (Fraction(value or 0) * (packet.time_base or 0) for value in (packet.pts, packet.duration))
+    time_ms, duration_ms = (round(time / TIME_BASE) for time in times)
+    return Packet(track, time_ms, duration_ms, bytes(packet))
 
 
 def _muxable(packet: Packet, stream: Any) -> av.Packet[Any]:
@@ -208,6 +226,10 @@ class Reader:
                 raise ValueError(f"{path}: video track {number} must be FFV1; the file is damaged or no scene")
         self.codec_private = tuple(stream.codec_context.extradata or b"" for stream in self._container.streams.video)
         """Of each track: what its decoder needs"""
+        self.sound_private = b"".join(
+            stream.codec_context.extradata or b"" for stream in self._container.streams.audio[:1]
+        )
+        """The same of sound; empty where there is none"""
         self._packets: Iterator[av.Packet[Any]] = self._container.demux(*self._container.streams.video)
 
     def close(self) -> None:
@@ -230,9 +252,11 @@ class Reader:
         return found
 
     def packets(self) -> Iterator[tuple[int, FoundPacket]]:
-        """Number of the track and packet, all in the order of the file from where the reader is."""
-        numbers = {stream.index: number for number, stream in enumerate(self._container.streams.video)}
-        for packet in self._packets:
+        """Number of the track and packet, all in the order of the file from where the reader is; sound comes as one
+        track more."""
+        streams = (*self._container.streams.video, *self._container.streams.audio[:1])
+        numbers = {stream.index: number for number, stream in enumerate(streams)}
+        for packet in self._container.demux(*streams):
             if packet.size:
                 yield numbers[packet.stream.index], FoundPacket(bytes(packet), packet.pos or 0)
 

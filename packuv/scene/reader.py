@@ -16,6 +16,7 @@ from packuv.scene.encoder import worker_count
 from packuv.scene.header import COMPRESSION, DYNAMIC, KEY, SceneHeader
 from packuv.scene.lookahead import Address, LookAhead
 from packuv.scene.sharing import assemble
+from packuv.scene.sound import Sound, read_sound
 from packuv.scene.source import Source
 from packuv.scene.stream import REPEAT, Playback, key_codes
 
@@ -137,6 +138,11 @@ class Scene:
         self.segment_at(frame)
         light: np.ndarray = self.header.light[frame].copy()
         return light
+
+    def sound(self) -> Sound | None:
+        """What was heard from the first frame on; None where the scene has no sound. Raises ValueError for sound that
+        is damaged, or of a kind that this program does not know."""
+        return read_sound(self.path, self.index.sound) if self.index.sound else None
 
     def _forget(self) -> None:
         self._segment = self._frame = -1

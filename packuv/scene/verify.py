@@ -26,8 +26,8 @@ class VerifyReport:
     span: tuple[int, int] | None = None
     """Bytes of that packet in the file, half-open, unless it is missing"""
     header: str = ""
-    """What is wrong with the header, its second copy, the file's length or the bytes around its pictures; what
-    that costs is in `bad`"""
+    """What is wrong with the header, its second copy, the file's length, its sound or the bytes around its pictures;
+    what that costs is in `bad`"""
 
     @property
     def ok(self) -> bool:
@@ -35,7 +35,7 @@ class VerifyReport:
 
 
 def verify_scene(path: Path, *, threads: int = 0, progress: Progress = no_progress) -> VerifyReport:
-    """Decode every frame and compare it with its digest in the header.
+    """Decode every frame and compare it with its digest in the header, and the sound with its own.
 
     Damage inside a segment costs the rest of that segment, and those that refer to its key only if that is damaged.
     Raises like `open_scene` when nothing can be read.
@@ -47,7 +47,7 @@ def verify_scene(path: Path, *, threads: int = 0, progress: Progress = no_progre
                 if trouble:
                     found.append((frame, trouble))
                 progress(frame + 1, len(scene))
-        count, header = len(scene), scene.damage_around()
+        count, header = len(scene), scene.damage or _damaged_sound(scene) or scene.damage_around()
     if not found:
         return VerifyReport(count, problem=header, header=header)
     first = found[0][1]
@@ -70,3 +70,11 @@ def _check_frames(scene: Scene, segment: SegmentEntry) -> Iterator[tuple[int, Va
         else:
             trouble = ValueError(f"{scene.path}: the codes of frame {frame} do not match their digest")
             yield frame, None if same else trouble
+
+
+def _damaged_sound(scene: Scene) -> str:
+    try:
+        scene.sound()
+    except ValueError as error:
+        return str(error)
+    return ""

@@ -36,7 +36,7 @@ from packuv.viewer.streams import (
 )
 
 FORMAT, VERSION, INDEX, VIDEO = "packuv-web", 2, "index.json", "video.json"
-KEY_FILE, DELTA_FILE = "key.ivf", "delta.ivf"
+KEY_FILE, DELTA_FILE, SOUND_FILE = "key.ivf", "delta.ivf", "sound.flac"
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,8 @@ def _write_bodies(
     source = SceneSource(scene)
     bodies, segments, checks = Bodies(source), [], []
     _write_json(folder / "scene.json", describe(source))
+    if heard := source.sound():
+        (folder / SOUND_FILE).write_bytes(heard)
     for number, frames in enumerate(source.segments):
         entry: dict[str, Any] = {"file": f"segment{number:05d}.bin", "parts": [], "frames": []}
         with (folder / entry["file"]).open("wb") as out:

@@ -39,10 +39,11 @@ PAGES = {
 """Path to file beside this module and its type; nothing else on disk is reachable"""
 
 BINARY, JSON = "application/octet-stream", "application/json"
+SOUND = "/sound.flac"
 PICTURE = re.compile(r"/truth/([^/]{1,600})/(0|[1-9][0-9]{0,8})\.png")
 NUMBERED = re.compile(r"/(segments|frames|layers)/(0|[1-9][0-9]{0,8})(?:/(0|[1-9][0-9]{0,3}))?\.bin")
 
-POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
+POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; media-src blob:"
 """Content security policy: a page that tries to reach another origin fails at once"""
 
 STATE = re.compile(r"(?:^|&)made=(\d+)(?:&|$)")
@@ -182,6 +183,8 @@ class ViewerServer(ThreadingHTTPServer):
             filmed = {"truth": list(self.truth.cameras)} if self.truth else {}
             told = {**describe(self.source), **marked, **filmed, **growing}
             return Content(_deflated(json.dumps(told).encode()), JSON)
+        if path == SOUND and (heard := self.source.sound()):
+            return Content(zlib.compress(heard, 0), "audio/flac")  # which is packed as it is
         if asked := PICTURE.fullmatch(path):
             return self._filmed(unquote(asked[1]), int(asked[2]))
         if numbered := NUMBERED.fullmatch(path):

@@ -72,6 +72,13 @@ class Source(Protocol):
         """Whether a world unit is a metre."""
 
     @property
+    def heard(self) -> str:
+        """Name of the camera that heard the sound of the scene; empty where it has none."""
+
+    def sound(self) -> bytes:
+        """A FLAC file of what was heard from the first frame on; empty where nothing was."""
+
+    @property
     def segments(self) -> tuple[range, ...]:
         """Frames of each segment without a gap; the first of each is its keyframe."""
 
@@ -111,6 +118,7 @@ class SegmentSource:
     near: float | None = None
     up: tuple[float, float, float] | None = None
     metric: bool = False
+    heard: str = ""
 
     def __post_init__(self) -> None:
         if not self.parts:
@@ -129,6 +137,9 @@ class SegmentSource:
     @property
     def light(self) -> np.ndarray:
         return np.zeros((len(self.times_ns), 3))
+
+    def sound(self) -> bytes:
+        return b""
 
     @property
     def segments(self) -> tuple[range, ...]:
@@ -162,11 +173,16 @@ class SceneSource:
         self.near: float | None = header.extra.get("near")
         self.up = header.up
         self.metric = header.extra.get("metric") is True
+        self.heard = scene.index.sound.camera if scene.index.sound else ""
         self.segments = tuple(range(entry.first, entry.first + entry.frames) for entry in scene.index.segments)
         self._keys: OrderedDict[int, Codes] = OrderedDict()
         self._moving: OrderedDict[int, Codes] = OrderedDict()
         self._rows = 0  # of all that is kept there
         self._last = -1  # frame at which the scene stands
+
+    def sound(self) -> bytes:
+        found = self._scene.sound()
+        return found.flac if found else b""
 
     def key(self, segment: int) -> Codes:
         if segment not in self._keys:
@@ -237,6 +253,7 @@ def describe(source: Source) -> dict[str, Any]:
         "cameras": [{**camera.to_json(), "held_out": camera.name in source.held_out} for camera in source.cameras],
         **({"light": source.light.tolist()} if source.light.any() else {}),
         **({"up": list(source.up)} if source.up else {}),
+        **({"sound": source.heard} if source.heard else {}),
     }
 
 

@@ -9,6 +9,7 @@ const RESUME_SECONDS = 0.5; // after a stall, play on once this much is there
 const STALL_NOTICE_MS = 250;
 const LOOK_MS = 5000, IDLE_MS = 10000; // between looks at whether there is more of what grows; without a touch
 const HERE = 1, LOST = 2; // what the worker says of a frame; 0 is on its way
+const APART_SECONDS = 0.15, NEAR_SECONDS = 0.02; // of sound and frames: sound jumps, goes on a little faster or slower
 const GAMMA = 2.4; // a factor on light is its power of 1 / 2.4 on sRGB + 0.055
 
 const at = (id) => document.getElementById(id);
@@ -25,6 +26,7 @@ const TRUTHS = ["", "beside", "over", "minus"];
 const truth = { mode: "", loading: "", shown: "" }; // addresses of pictures
 const path = []; // views of a camera path, as packuv.film reads them
 const filming = { on: false, stopped: false, told: null }; // told: hears that a picture has come
+const sound = { voice: new Audio(), asked: false, on: true };
 const layered = { shown: -1, asked: -1 }; // segments
 const ruler = { on: false, points: [] }; // world
 const buffer = { map: new Uint8Array(0), ahead: 1, trouble: "", closed: false }; // closed: the user knows of the trouble
@@ -89,6 +91,7 @@ const receive = {
     look.light = (scene.light?.[lit] ?? [0, 0, 0]).map((log) => Math.exp(log / GAMMA));
     const { count, moving, sort_ms, visible, traffic } = message;
     if (visible) document.documentElement.dataset.first ??= performance.now(); // for automation: ms to a picture
+    if (visible && !sound.asked) fetchSound();
     Object.assign(meter, { count, moving, sort_ms, visible, traffic });
     dirty = true;
     filming.told?.();
@@ -205,12 +208,47 @@ function setPlaying(playing) {
   at("play").textContent = playing ? "Pause" : "Play";
 }
 
+// ---- sound
+
+// All of it, once there is a picture: servers that know no ranges would let nobody seek in it.
+async function fetchSound() {
+  sound.asked = true;
+  const answer = scene.sound && await fetch("sound.flac").catch(() => null);
+  if (!answer?.ok) return;
+  sound.voice.src = URL.createObjectURL(await answer.blob());
+  at("sound").title += `: what ${scene.sound} heard`;
+  at("sound").hidden = false;
+}
+
+// Frames lead. What is heard is what was filmed, so only as fast and forth; a browser plays nothing before it is touched.
+function hear() {
+  const { voice } = sound, told = document.documentElement.dataset, now = scene.times_ns[player.frame] / 1e9 + player.due;
+  const goesOn = player.playing && !player.stalled && !scrubbing && !filming.on && !document.hidden;
+  const asFilmed = player.speed === 1 && player.ends !== "bounce" && now < voice.duration - (voice.ended ? APART_SECONDS : 0);
+  if (!goesOn || !asFilmed || !sound.on || !(navigator.userActivation?.hasBeenActive ?? true)) {
+    voice.pause();
+    delete told.apart;
+    return;
+  }
+  const apart = voice.currentTime - now;
+  if (Math.abs(apart) > APART_SECONDS) voice.currentTime = now;
+  voice.playbackRate = Math.abs(apart) < NEAR_SECONDS ? 1 : 1 - Math.max(-0.1, Math.min(0.1, apart));
+  if (voice.paused) voice.play().catch(() => {}); // paused again before it began
+  told.apart = apart; // for automation
+}
+
+function setSound(on) {
+  sound.on = on;
+  press("sound", on);
+}
+
 // ---- drawing
 
 function tick(now) {
   requestAnimationFrame(tick);
-  const seconds = Math.min(0.25, (now - previous) / 1000);
+  const seconds = Math.min(sound.voice.paused ? 0.25 : 2, (now - previous) / 1000); // sound goes on between pictures
   previous = now;
+  hear();
   if (filming.on) return;
   fitCanvas();
   navigation.step(now, seconds);
@@ -680,6 +718,7 @@ const KEYS = {
   b: () => { if (scene.sh_degree) cycleBands(); },
   i: () => at("stats").toggleAttribute("hidden"),
   m: () => setMeasuring(!ruler.on),
+  n: () => setSound(!sound.on),
   k: addView,
   Backspace: takeBack,
   j: savePath,
@@ -711,6 +750,7 @@ function listen() {
     event.preventDefault();
     action(event);
   });
+  document.addEventListener("visibilitychange", () => sound.voice.pause()); // ticks end where nobody looks
   canvas.addEventListener("dblclick", focusAt);
   let pressed = null;
   canvas.addEventListener("pointerdown", (event) => { pressed = event; });
@@ -739,6 +779,7 @@ function listen() {
   at("path-save").onclick = savePath;
   at("path-film").onclick = film;
   at("measure").onclick = KEYS.m;
+  at("sound").onclick = KEYS.n;
   at("link").onclick = linkHere;
   at("shot").onclick = savePicture;
   at("dismiss").onclick = dismiss;

@@ -76,6 +76,8 @@ def _write_clip(clip: Clip, arguments: argparse.Namespace, kind: SplatFormat) ->
 def _told(clip: Clip, kind: SplatFormat, count: int) -> Iterator[str]:
     """What went otherwise than in the scene: what the format loses, is left out, or was made of light and rows."""
     yield f"format     {kind.door.lacks}"
+    if clip.heard and len(clip) > 1:
+        yield f"sound      of {clip.heard} " + ("goes along, as FLAC" if kind.door.sounds else "is left out")
     if left := clip.drawn - count:  # by SPZ's fixed point
         yield f"left out   {left:,} of {clip.drawn:,} Gaussians, so far away that others would have coarse positions"
     if clip.options.keep_rows:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from packuv.camera import PinholeCamera
     from packuv.film import CameraPath
-    from packuv.scene import SceneHeader
+    from packuv.scene import Scene, SceneHeader
     from packuv.scene.verify import VerifyReport
     from pipelines.filmed import Filmed
 
@@ -62,10 +62,11 @@ def info(arguments: argparse.Namespace) -> int:
             "bytes": size,
             "frames": len(scene),
             "rate": str(header.rate),
-            "seconds": float((header.times_ns[-1] - header.times_ns[0]) / 1e9 + 1 / header.rate),
+            "seconds": header.seconds,
             "bytes_per_frame": size / len(scene),
             "sh_degree": header.quantizer.sh_degree,
             "light": _light_range(header.light),
+            "sound": index.sound and {**vars(index.sound), "seconds": index.sound.seconds},
             "lossless": scene.lossless,
             "compression": _compression(header.extra, size),
             "tolerance": vars(index.tolerance),
@@ -108,6 +109,7 @@ def _info_text(facts: Mapping[str, Any]) -> str:
     held_out = f" (held out: {', '.join(facts['held_out'])})" if facts["held_out"] else ""
     within = "within {position} steps of a position and {attribute} of any other code, of what was fitted"
     lights = ["light      {:.1%} to {:.1%} of steady light".format(*facts["light"])] if facts["light"] else []
+    sounds = ["sound      {codec}, {seconds:.2f} s, of {camera}".format(**facts["sound"])] if facts["sound"] else []
     exact = "exactly as fitted" if facts["lossless"] else within.format(**facts["tolerance"])
     if made := facts["compression"]:
         exact = (
@@ -123,6 +125,7 @@ def _info_text(facts: Mapping[str, Any]) -> str:
             f"SH degree {facts['sh_degree']}",
             f"codes      {exact}",
             *lights,
+            *sounds,
             f"cameras    {len(facts['cameras'])}{held_out}",
             f"tools      {', '.join(f'{name} {version}' for name, version in facts['tools'].items())}",
         ]
@@ -216,7 +219,7 @@ def film(arguments: argparse.Namespace) -> int:
         raise ValueError(f"the film becomes an MP4, so its name must end with .mp4, but is {arguments.output.name}")
     path, device = CameraPath.load(arguments.path), choose_device(arguments.device)
     with open_scene(arguments.scene) as scene, shown(arguments, "film") as progress:
-        camera, sound = _sound_of(scene.header, arguments, path)
+        camera, sound = _sound_of(scene, arguments, path)
         count = shoot(
             scene, path, arguments.output, progress, rate=arguments.fps, size=arguments.size, device=device, sound=sound
         )
@@ -225,13 +228,19 @@ def film(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _sound_of(header: SceneHeader, arguments: argparse.Namespace, path: CameraPath) -> tuple[str, np.ndarray | None]:
-    """The camera that heard what a film shows, and its sound; a note where the run's own capture has changed."""
+def _sound_of(scene: Scene, arguments: argparse.Namespace, path: CameraPath) -> tuple[str, np.ndarray | None]:
+    """The camera that heard what a film shows, and its sound: of the capture that is named, or else of the scene, or
+    of the run's own capture, with a note where that has changed."""
+    from packuv.film import SOUND_RATE
+
     if arguments.capture:
-        return _heard(header, arguments.capture, path)
+        return _heard(scene.header, arguments.capture, path)
+    if sound := scene.sound():
+        start, count = (round(seconds * SOUND_RATE) for seconds in _span(scene.header, path))
+        return sound.camera, sound.samples(start, count)
     capture = _capture_of(arguments.scene.parent)
     try:
-        return _heard(header, capture, path) if capture else ("", None)
+        return _heard(scene.header, capture, path) if capture else ("", None)
     except (OSError, ValueError) as error:
         print(f"packuv: the film has no sound: {error}", file=sys.stderr)
         return "", None
@@ -242,18 +251,23 @@ def _heard(header: SceneHeader, capture: Path, path: CameraPath) -> tuple[str, n
     shows, and its name; no name where none heard anything."""
     from packuv.film import SOUND_RATE
     from sync.capture import find_capture
-    from sync.content.sound import listen
+    from sync.content.sound import listen_to_one
+    from tasks.stages.encode import in_turn
     from tasks.stages.evaluate import filmed_views, known_cameras
 
-    names, videos = known_cameras(header), find_capture(capture).videos
+    names = known_cameras(header)
     frames = filmed_views(header, capture, names).frames  # [T, C], -1 where a camera has none
-    first, last = (end(min(view.frame, len(frames) - 1) for view in path.views) for end in (min, max))
-    seconds = float(header.times_ns[last] - header.times_ns[first]) / 1e9 + float(1 / header.rate)
-    for camera in sorted(names, key=lambda name: name != header.sync.get("reference")):
-        frame = int(frames[first, names.index(camera)])
-        if frame >= 0 and (sound := listen(videos[camera], frame, seconds, SOUND_RATE)) is not None:
-            return camera, sound
-    return "", None
+    first = min(min(view.frame for view in path.views), len(frames) - 1)
+    asked = in_turn(dict(zip(names, map(int, frames[first]), strict=True)), header)
+    return listen_to_one(find_capture(capture).videos, asked, _span(header, path)[1], SOUND_RATE) or ("", None)
+
+
+def _span(header: SceneHeader, path: CameraPath) -> tuple[float, float]:
+    """Seconds of the scene from its first frame to the earliest that a path shows, and from that to the end of the
+    last."""
+    shown = [min(view.frame, len(header.times_ns) - 1) for view in path.views]
+    earliest, latest = (header.seconds_to(frame) for frame in (min(shown), max(shown)))
+    return earliest, latest - earliest + float(1 / header.rate)
 
 
 def _camera(name: str, known: Sequence[PinholeCamera]) -> PinholeCamera:

@@ -69,10 +69,10 @@ def listen(video: Path, frame: int, seconds: float, rate: int) -> np.ndarray | N
     """What a video holds to hear from one of its frames on, float32 [2, n] at `rate`, silent where it has a gap.
 
     Of the first sound track with anything but timecode on it, the first two channels that are none; one alone is heard
-    on both sides. None where there is no such track.
+    on both sides. None where there is no such track, or nothing but silence.
     """
     for track in sound_tracks(video):
-        labels, heard, found = label_channels(track), np.zeros((2, round(seconds * rate)), np.float32), False
+        labels, heard = label_channels(track), np.zeros((2, round(seconds * rate)), np.float32)
         start = _shown_at(video, frame)
         for begins, samples in track.blocks(BLOCK_S, rate):
             voices = [wave for channel, wave in enumerate(samples) if channel not in labels][:2]
@@ -82,9 +82,21 @@ def listen(video: Path, frame: int, seconds: float, rate: int) -> np.ndarray | N
             for side in range(2 if voices else 0):
                 part = voices[side % len(voices)][max(0, -at) :][: heard.shape[1] - max(at, 0)]
                 heard[side, max(at, 0) : max(at, 0) + len(part)] = part
-            found = found or bool(voices)
-        if found:
+        if heard.any():
             return heard
+    return None
+
+
+def listen_to_one(
+    videos: Mapping[str, Path], frames: Mapping[str, int], seconds: float, rate: int
+) -> tuple[str, np.ndarray] | None:
+    """The first of these cameras that heard anything from its frame on, and what, see `listen`; None where none did.
+
+    `frames` are in the order in which cameras are asked; one whose frame is -1 is passed over.
+    """
+    for camera, frame in frames.items():
+        if frame >= 0 and (heard := listen(videos[camera], frame, seconds, rate)) is not None:
+            return camera, heard
     return None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -16,10 +17,13 @@ from packuv.footage.lens import undistorted_camera
 from packuv.footage.light import packed
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.segment import Segment
-from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
+from packuv.scene import EncodeOptions, SceneHeader, Sound, Tolerance, open_scene, write_scene
 from packuv.scene.sharing import stored_segments
+from packuv.scene.sound import RATE
 from sync.align import SyncReport
+from sync.capture import find_capture
 from sync.clock import ClockMode
+from sync.content.sound import listen_to_one
 from tasks.artefacts.stage import Notes, Site, Stage, Work
 from tasks.artefacts.store import Key
 from tasks.stages.fitting import SEGMENT
@@ -33,7 +37,7 @@ SCENE = "scene.mkv"
 class Encode(Stage):
     """Write the scene file from the segments, in order; by default lossless."""
 
-    name, version = "encode", 5
+    name, version = "encode", 6
     take: Take
     """All cameras"""
     held_out: tuple[str, ...]
@@ -46,7 +50,8 @@ class Encode(Stage):
         header = self._header(work.site)
         segments = [work.path(key) / SEGMENT for key in self.segments]
         path = work.out / SCENE
-        summary = write_scene(path, segments, header, options=self.options, progress=work.progress)
+        sound = self._sound(work.site, header)
+        summary = write_scene(path, segments, header, sound=sound, options=self.options, progress=work.progress)
         notes = {"frames": summary.frames, "bytes": summary.bytes, "track_bytes": dict(summary.track_bytes)}
         save_json(work.out / "encode.json", notes)
         return notes
@@ -60,12 +65,20 @@ class Encode(Stage):
         """
         header = self._header(site)
         segments = [site.path(key) / SEGMENT for key in self.segments]
-        frames = sum(len(Segment.load(part)) for part in segments)
-        return write_scene(path, segments, header.first(frames), options=self.options).frames
+        header = header.first(sum(len(Segment.load(part)) for part in segments))
+        return write_scene(path, segments, header, sound=self._sound(site, header), options=self.options).frames
 
     def _header(self, site: Site) -> SceneHeader:
         footage = Footage(self.take, site)
         return scene_header(footage, self.held_out, KeyState.load(site.path(self.key)), footage.load_light())
+
+    def _sound(self, site: Site, header: SceneHeader) -> Sound | None:
+        """What the reference camera, or else another one, heard from the first frame of the scene to its end."""
+        if not self.options.sound:
+            return None
+        frames = {name: int(own[0]) for name, own in Footage(self.take, site).load_frames().items()}
+        heard = listen_to_one(find_capture(site.capture).videos, in_turn(frames, header), header.seconds, RATE)
+        return heard and Sound.of(*heard)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +111,11 @@ class Verify(Stage):
         notes = {"frames": frame, "exact": worst.exact, "largest_error": vars(worst)}
         save_json(work.out / "verify.json", notes)
         return notes
+
+
+def in_turn(frames: Mapping[str, int], header: SceneHeader) -> dict[str, int]:
+    """Cameras in the order in which they are asked for the sound of a scene, with their frames: the reference first."""
+    return dict(sorted(frames.items(), key=lambda item: item[0] != header.sync.get("reference")))
 
 
 def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState, light: Light | None = None) -> SceneHeader:

@@ -36,7 +36,7 @@ from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes, Quantizer, att
 from packuv.gaussians.segment import Segment
 from packuv.interchange import read_gaussians, write_compressed_ply, write_ply
 from packuv.interchange.spz import write_spz_3
-from packuv.scene import SceneHeader, open_scene, verify_scene, write_scene
+from packuv.scene import SceneHeader, Sound, open_scene, verify_scene, write_scene
 from packuv.scene.header import CHECKSUM, HEADER
 from packuv.scene.lookahead import DamageError
 from packuv.scene.matroska import Packet, VideoTrack, write_matroska
@@ -130,7 +130,8 @@ def make_scene(path: Path) -> None:
         header = SceneHeader(
             quantizer, times, Fraction(30), (camera,), ("cam0",), {"worst_ms": 1.5}, {"near": 0.1}, light
         )
-        write_scene(path, parts, header)
+        heard = Sound.of("cam0", rng.uniform(-1, 1, (2, 9600)).astype(np.float32))
+        write_scene(path, parts, header, sound=heard)
 
 
 class SceneMaker:
@@ -175,6 +176,8 @@ def read_scene(path: Path) -> None:
         assert np.abs(scene.header.light).max() <= MOST_LIGHT
         for frame in range(min(len(scene), 50)):
             scene.gaussians(frame)
+        if heard := scene.sound():
+            heard.samples(100, 5000)
     verify_scene(path, threads=1)
 
 

@@ -11,7 +11,7 @@ from packuv.camera import PinholeCamera
 from packuv.gaussians.codes import DC, OPACITY, OPACITY_RANGE, ROTATION, SCALE, Codes, Quantizer, attribute_count
 from packuv.gaussians.floats import Gaussians, with_canonical_axes
 from packuv.gaussians.segment import Segment
-from packuv.scene import SceneHeader, write_scene
+from packuv.scene import SceneHeader, Sound, write_scene
 
 ROWS, MOVING, FRAMES = 500, 120, 6
 
@@ -48,14 +48,15 @@ def small_segments() -> list[Segment]:
     return segments
 
 
-def small_scene(path: Path, segments: list[Segment] | None = None) -> Path:
-    """Write it, lossless, or other segments of as many frames."""
+def small_scene(path: Path, segments: list[Segment] | None = None, sound: Sound | None = None) -> Path:
+    """Write it, lossless, or other segments of as many frames, with sound if any is given."""
     paths = [path.with_name(f"{number}.npz") for number in range(2)]
     for place, segment in zip(paths, segments or small_segments(), strict=True):
         segment.save(place)
     cameras = tuple(_camera(f"cam{number}", 0.5 * number) for number in range(3))
     times = np.arange(FRAMES, dtype=np.int64) * 40_000_000
-    write_scene(path, paths, SceneHeader(small_quantizer(), times, Fraction(25), cameras, ("cam2",), {}, {"near": 0.1}))
+    header = SceneHeader(small_quantizer(), times, Fraction(25), cameras, ("cam2",), {}, {"near": 0.1})
+    write_scene(path, paths, header, sound=sound)
     return path
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from sync.audio import sound_tracks
 from sync.content import sound as module
-from sync.content.sound import RATE, Sound, hear, listen, loudness, starts_by_sound
+from sync.content.sound import RATE, Sound, hear, listen, listen_to_one, loudness, starts_by_sound
 from sync.timecode import frame_to_label
 from tests.support.ltc import wave
 from tests.support.sounds import SECONDS, recorded, room, write_video
@@ -127,5 +127,19 @@ def test_listening_begins_at_a_frame_and_is_heard_on_both_sides(tmp_path):
     assert not beyond[:, RATE // 2 :].any()
     write_video(tmp_path / "mono.mkv", sides[0])
     assert np.allclose(listen(tmp_path / "mono.mkv", 0, 2.0, RATE), sides[[0, 0]], atol=1e-6)
-    write_video(tmp_path / "silent.mkv")
-    assert listen(tmp_path / "silent.mkv", 0, 1.0, RATE) is None
+    write_video(tmp_path / "none.mkv")
+    write_video(tmp_path / "silent.mkv", np.zeros(2 * RATE))
+    for name in ("none", "silent"):
+        assert listen(tmp_path / f"{name}.mkv", 0, 1.0, RATE) is None
+
+
+def test_the_first_camera_that_heard_anything_is_listened_to(tmp_path):
+    rng = np.random.default_rng(0)
+    tracks = {"quiet": np.zeros(2 * RATE), "late": rng.normal(size=2 * RATE), "loud": rng.normal(size=2 * RATE)}
+    videos = {name: tmp_path / f"{name}.mkv" for name in tracks}
+    for name, samples in tracks.items():
+        write_video(videos[name], samples)
+    camera, heard = listen_to_one(videos, {"quiet": 0, "late": -1, "loud": 3}, 1.0, RATE)
+    assert camera == "loud"
+    assert np.array_equal(heard, listen(videos["loud"], 3, 1.0, RATE))
+    assert listen_to_one(videos, {"quiet": 0, "late": -1}, 1.0, RATE) is None

@@ -18,7 +18,8 @@ from packuv.interchange import DOORS, WRITTEN, SplatFormat, antialiased, format_
 from packuv.interchange.clip import Baking, Clip, ClipOptions, Part, baking_error
 from packuv.interchange.conventions import half_turn, is_drawn, rows_out
 from packuv.interchange.sog_writer import _codebook, _groups
-from packuv.scene import open_scene
+from packuv.scene import Sound, open_scene
+from packuv.scene.sound import RATE
 from pipelines.cli import SPLAT_FORMATS
 from tests.support.needs import needs
 from tests.support.small_scene import FRAMES, MOVING, ROWS, small_scene, small_segments
@@ -339,6 +340,24 @@ def test_fourdgs_shows_each_frame_at_its_time(scene, tmp_path):
         truth = np.stack([half_turn(frame).means for frame in opened])  # [T, N, 3]
         assert np.array_equal(sources[:, 0] == 1, born >= FRAMES // 2)
         assert np.abs(whole.positions - truth[born, sources[:, 1]]).max() <= 2 * step  # the row says which it is
+
+
+@needs_fourdgs
+def test_fourdgs_holds_what_is_heard_of_its_frames(scene, tmp_path):
+    import fourdgs
+
+    samples = np.random.default_rng(0).integers(-9000, 9000, (2, round(FRAMES / 25 * RATE))) / 2**15
+    loud = small_scene(tmp_path / "loud.mkv", sound=Sound.of("cam1", samples.astype(np.float32)))
+    for path, frames in ((loud, range(FRAMES)), (loud, range(2, 4)), (scene, range(FRAMES))):
+        with open_scene(path) as opened:
+            SplatFormat.FOURDGS.door.write_clip(tmp_path / "a.4dgs", Clip(opened, frames, ClipOptions()))
+        sources = fourdgs.read(str(tmp_path / "a.4dgs")).audio_sources
+        assert len(sources) == (path is loud)
+        for source in sources:
+            assert (source.codec, source.name, source.start_sec, source.spatial) == ("flac", "cam1", 0, False)
+            assert source.duration_sec == pytest.approx(len(frames) / 25)
+            heard = Sound(source.name, source.data).samples()
+            assert np.array_equal(heard, samples[:, frames.start * RATE // 25 : frames.stop * RATE // 25])
 
 
 @needs_fourdgs

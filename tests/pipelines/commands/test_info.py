@@ -17,6 +17,7 @@ def facts(segments: int) -> dict:
         "seconds": 40 * segments / 30,
         "sh_degree": 0,
         "light": None,
+        "sound": None,
         "lossless": True,
         "compression": None,
         "tolerance": {"position": 0, "attribute": 0},

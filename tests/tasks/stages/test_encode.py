@@ -14,6 +14,7 @@ from packuv.footage import Light
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.scene import EncodeOptions, SceneHeader, Tolerance, open_scene, write_scene
+from packuv.scene.sound import RATE
 from sync.align import AlignOptions, align
 from sync.timecode import Timecodes
 from tasks.artefacts.stage import Site
@@ -22,6 +23,7 @@ from tasks.stages.fitting import SEGMENT
 from tasks.stages.footage import RIG, Footage, Take
 from tests.support.artefacts import build_here, put
 from tests.support.calibration_scene import ring
+from tests.support.sounds import write_video
 
 COLUMNS = attribute_count(0)
 
@@ -68,10 +70,18 @@ def digest(segment):
 QUANTIZER = Quantizer(np.zeros(3), 1.0, np.ones(3), np.full(COLUMNS, -1.0), np.full(COLUMNS, 1.0))
 
 
+def film(site, names, **sounds):
+    """A capture of these cameras, with what some of them heard, at 48,000 samples a second."""
+    (site.capture / "videos").mkdir(exist_ok=True)
+    for name in names:
+        write_video(site.capture / f"videos/{name}.mkv", sounds.get(name), rate=RATE)
+
+
 @pytest.fixture
 def take(site):
-    """Six instants of three cameras, calibrated."""
+    """Six instants of three cameras, calibrated, that heard nothing."""
     rig = ring(3)
+    film(site, rig.names)
     stamps = Timecodes(np.arange(6, dtype=np.int64) * 10**8, np.arange(6))
     groups, report = align(dict.fromkeys(rig.names, stamps), AlignOptions())
 
@@ -133,6 +143,27 @@ def test_what_is_fitted_so_far_plays_and_grows_into_the_whole(site, take, key, f
     _, out = build_here(whole, site, tmp_path)
     assert whole.write_finished(path, site) == 6
     assert path.read_bytes() == (out / SCENE).read_bytes()
+
+
+def test_the_scene_sounds_as_the_reference_camera_heard_it(site, take, key, fitted, tmp_path):
+    stage = Encode(take=replace(take, first=2), held_out=(), key=key, segments=fitted[:1], options=EncodeOptions())
+    _, out = build_here(replace(stage, take=replace(take, first=2, stop=5)), site, tmp_path)
+    silent = (out / SCENE).read_bytes()
+    rng = np.random.default_rng(0)
+    sounds = [rng.integers(-9000, 9000, (2, 2 * RATE)) / 2**15 for _ in range(3)]
+    reference = Footage(take, site).load_groups().reference
+    for heard in range(3):  # by the last cameras, and at last by all
+        film(site, take.cameras, **dict(zip(take.cameras[::-1], sounds[: heard + 1], strict=False)))
+        _, out = build_here(replace(stage, take=replace(take, first=2, stop=5)), site, tmp_path)
+        with open_scene(out / SCENE) as scene:
+            sound = scene.sound()
+        first = next(name for name in (reference, *take.cameras) if name in take.cameras[2 - heard :])
+        assert sound.camera == first
+        whole = sounds[2 - take.cameras.index(first)]
+        assert np.array_equal(sound.samples(), whole[:, RATE // 5 : RATE // 2])  # from the third of ten frames a second
+    mute = replace(stage, take=replace(take, first=2, stop=5), options=EncodeOptions(sound=False))
+    _, out = build_here(mute, site, tmp_path)
+    assert (out / SCENE).read_bytes() == silent
 
 
 def write(site, keys, tolerance=None):
