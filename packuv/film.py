@@ -125,7 +125,11 @@ def _view(told: object, what: str) -> PathView:
 
 def _turned(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
     """The rotation [3, 3] a share of the way from one to another, about one axis."""
-    return np.asarray(cv2.Rodrigues(share * cv2.Rodrigues(b @ a.T)[0])[0] @ a)
+    between = b @ a.T
+    vector = cv2.Rodrigues(between)[0][:, 0]
+    if not vector.any():  # it takes turns below 1e-5 for none
+        vector = (between - between.T)[[2, 0, 1], [1, 2, 0]] / 2
+    return np.asarray(cv2.Rodrigues(share * vector)[0] @ a)
 
 
 def _between(a: PinholeCamera, b: PinholeCamera, share: float, pose: np.ndarray) -> PinholeCamera:
