@@ -54,6 +54,7 @@ def rounded_bits(mean: np.ndarray, sigma: np.ndarray, most: int) -> np.ndarray:
     bits: np.ndarray = np.log2(2 * np.pi * np.e * (width**2 + 1 / 12)) / 2
     ends = (middle < TAIL * width) | (middle > most - TAIL * width)
     summed = np.flatnonzero((width < WIDE) | ends)
+    summed = summed[np.argsort(width[summed])]  # so that a part needs no more codes than its values do
     for part in np.array_split(summed, -(-len(summed) // PART)) if len(summed) else []:
         bits[part] = _summed(middle[part, None], width[part, None], most)
     return bits.reshape(mean.shape)
@@ -61,10 +62,9 @@ def rounded_bits(mean: np.ndarray, sigma: np.ndarray, most: int) -> np.ndarray:
 
 def _summed(middle: np.ndarray, width: np.ndarray, most: int) -> np.ndarray:
     reach = int(np.ceil(TAIL * width.max())) + 1
-    codes = np.clip(np.rint(middle), 0, most) + np.arange(-reach, reach + 1)
-    above = np.where(codes >= most, np.inf, codes + 0.5)
-    below = np.where(codes <= 0, -np.inf, codes - 0.5)
-    share = ndtr((above - middle) / width) - ndtr((below - middle) / width)
-    share[(codes < 0) | (codes > most)] = 0
+    edges = np.clip(np.rint(middle), 0, most) + (np.arange(-reach, reach + 2) - 0.5)  # below each code, and the last's
+    below = ndtr((edges - middle) / width)
+    below[edges < 0], below[edges > most] = 0, 1
+    share = np.diff(below, axis=1)
     bits: np.ndarray = -(share * np.log2(np.maximum(share, 1e-300))).sum(axis=1)
     return bits
