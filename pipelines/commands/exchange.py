@@ -271,12 +271,15 @@ def export_atlas(arguments: argparse.Namespace) -> int:
     """`packuv export atlas`: the atlas as an ordinary video."""
     from packuv.atlas import AtlasCodec, AtlasVideoOptions
     from packuv.atlas import export_atlas as write
+    from packuv.scene import open_scene
 
     options = AtlasVideoOptions(AtlasCodec(arguments.codec), arguments.crf, _uv(arguments))
     with shown(arguments, "export") as progress:
         summary = write(arguments.scene, arguments.output, options=options, progress=progress)
+    with open_scene(arguments.scene) as scene:
+        heard = scene.index.sound.camera if scene.index.sound else ""
     facts = {"file": str(arguments.output), "codec": arguments.codec, "crf": arguments.crf, "exact": summary.exact}
-    print_facts({**facts, **vars(summary)}, arguments.json, _atlas_text)
+    print_facts({**facts, **vars(summary), "sound_left_out": heard}, arguments.json, _atlas_text)
     return 0
 
 
@@ -284,6 +287,7 @@ def _atlas_text(facts: Mapping[str, Any]) -> str:
     tracks = ", ".join(f"{name} {size_text(count)}" for name, count in facts["track_bytes"].items())
     errors = ", ".join(f"{name} {value:.2f}" for name, value in facts["rms"].items())
     share = facts["seated"] / max(1, facts["gaussians"])
+    sounds = [f"sound      of {facts['sound_left_out']} is left out"] if facts["sound_left_out"] else []
     return "\n".join(
         [
             f"{facts['file']}: {counted(facts['frames'], 'frame')} of {facts['width']}x{facts['height']}, "
@@ -291,6 +295,7 @@ def _atlas_text(facts: Mapping[str, Any]) -> str:
             f"tracks     {tracks}",
             f"gaussians  {share:.2%} of those drawn have a texel",
             "check      decodes to exactly what was drawn" if facts["exact"] else f"error      rms in steps: {errors}",
+            *sounds,
         ]
     )
 

@@ -50,6 +50,8 @@ def test_info_and_verify_tell_of_sound(loud, tmp_path, capsys):
 def test_an_export_says_what_becomes_of_the_sound(loud, tmp_path, capsys):
     assert main(["export", str(loud), "--frames", "0:2", "-o", str(tmp_path / "frames")]) == 0
     assert "sound      of cam1 is left out\n" in capsys.readouterr().out
+    assert main(["export", "atlas", str(loud), "-o", str(tmp_path / "atlas.mkv")]) == 0
+    assert "sound      of cam1 is left out\n" in capsys.readouterr().out
     assert main(["export", str(loud), "--frame", "0", "-o", str(tmp_path / "frame.ply")]) == 0
     assert "sound" not in capsys.readouterr().out
 
