@@ -191,6 +191,8 @@ class SceneFigures:
     """Whether every frame decodes to what was fitted; None: nobody looked"""
     problem: str = ""
     """What verification found wrong"""
+    sound: str = ""
+    """Name of the camera that heard the sound in the file; empty where it has none"""
 
     def __post_init__(self) -> None:
         if not len(self.frame_bytes) == len(self.gaussians) == len(self.dynamic):
@@ -342,6 +344,7 @@ def scene_figures(scene: Scene, *, verified: bool | None = None, problem: str = 
         tuple(segment.dynamic for segment in index.segments for _ in range(segment.frames)),
         verified,
         problem,
+        index.sound.camera if index.sound else "",
     )
 
 

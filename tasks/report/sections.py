@@ -396,6 +396,7 @@ def _size(report: ReportInput) -> Body:
         "means": [(kind, sizes[rows].mean()) for kind, rows in kinds if rows.any()],
         "whole_mb": scene.bytes / 1e6,
         "overhead_mb": scene.bytes / 1e6 - sizes.sum(),
+        "sound": scene.sound,
         "each": scene.frames <= MOST_BARS,
         "frames": bar_chart(sizes.tolist(), title="Size over time", x_label="frame", y_label="MB", strong=keyframes),
     }

@@ -758,7 +758,7 @@ def test_durations_read_well(seconds: float | None, words: str) -> None:
 def test_figures_of_a_scene_come_from_its_header(tmp_path: Path) -> None:
     from packuv.gaussians.codes import OPACITY_RANGE, Codes, Quantizer, attribute_count
     from packuv.gaussians.segment import Segment
-    from packuv.scene import SceneHeader, open_scene, write_scene
+    from packuv.scene import SceneHeader, Sound, open_scene, write_scene
 
     rng, columns = np.random.default_rng(1), attribute_count(0)
     low, high = np.full(columns, -1.0), np.full(columns, 1.0)
@@ -776,7 +776,8 @@ def test_figures_of_a_scene_come_from_its_header(tmp_path: Path) -> None:
         paths.append(tmp_path / f"{first}.npz")
         Segment(first, key, moves, xyz, attributes).save(paths[-1])
     times = np.arange(5, dtype=np.int64) * 40_000_000
-    written = write_scene(tmp_path / "scene.mkv", paths, SceneHeader(quantizer, times, Fraction(25)))
+    header = SceneHeader(quantizer, times, Fraction(25))
+    written = write_scene(tmp_path / "scene.mkv", paths, header)
     with open_scene(tmp_path / "scene.mkv") as scene:
         figures = scene_figures(scene, verified=True)
     assert figures.gaussians == (40, 40, 40, 50, 50)
@@ -785,6 +786,12 @@ def test_figures_of_a_scene_come_from_its_header(tmp_path: Path) -> None:
     assert sum(figures.frame_bytes) == sum(written.track_bytes.values())
     assert figures.frame_bytes[1] == 0 < min(figures.frame_bytes[index] for index in (0, 2, 3, 4))
     assert summary(ReportInput("s", scene=figures))["mb_per_30_frames"] == pytest.approx(written.bytes * 6 / 1e6)
+    assert "of it header and index.</p>" in page_text(ReportInput("s", scene=figures))
+    write_scene(tmp_path / "loud.mkv", paths, header, sound=Sound.of("cam7", np.ones((2, 9600), np.float32) / 2))
+    with open_scene(tmp_path / "loud.mkv") as scene:
+        loud = scene_figures(scene)
+    assert (loud.sound, loud.frame_bytes) == ("cam7", figures.frame_bytes)
+    assert "of it header and index, and what cam7 heard.</p>" in page_text(ReportInput("s", scene=loud))
 
 
 def test_figures_that_do_not_belong_together_are_refused() -> None:
