@@ -98,8 +98,7 @@ class Clip:
     @property
     def heard(self) -> str:
         """Name of the camera that heard the sound of the scene; empty where it has none."""
-        told = self._scene.index.sound
-        return told.camera if told else ""
+        return self._scene.index.heard
 
     def sound(self) -> Sound | None:
         """What was heard from the first of the frames to the end of the last; None where that is nothing."""

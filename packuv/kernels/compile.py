@@ -95,7 +95,7 @@ def _imported(path: Path) -> frozenset[Path]:
     docstring with a line like an import adds a file to the digest, and does no harm.
     """
     names: list[str] = []
-    for found in IMPORT.finditer(COMMENT.sub("", path.read_text())):
+    for found in IMPORT.finditer(COMMENT.sub("", path.read_text("utf-8"))):
         module, imported, plain = found.groups()
         if plain is not None:
             names += [part.split()[0] for part in plain.split(",") if part.strip()]

@@ -372,6 +372,11 @@ class SceneIndex:
     sound: SoundEntry | None = None
     """What the sound must be that goes along, if any does"""
 
+    @property
+    def heard(self) -> str:
+        """Name of the camera that heard the sound; empty where there is none."""
+        return self.sound.camera if self.sound else ""
+
     def __post_init__(self) -> None:
         frames = sum(segment.frames for segment in self.segments)
         if not frames == len(self.header.times_ns) == len(self.digests) or not self.tracks:

@@ -173,7 +173,7 @@ class SceneSource:
         self.near: float | None = header.extra.get("near")
         self.up = header.up
         self.metric = header.extra.get("metric") is True
-        self.heard = scene.index.sound.camera if scene.index.sound else ""
+        self.heard = scene.index.heard
         self.segments = tuple(range(entry.first, entry.first + entry.frames) for entry in scene.index.segments)
         self._keys: OrderedDict[int, Codes] = OrderedDict()
         self._moving: OrderedDict[int, Codes] = OrderedDict()

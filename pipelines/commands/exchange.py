@@ -277,7 +277,7 @@ def export_atlas(arguments: argparse.Namespace) -> int:
     with shown(arguments, "export") as progress:
         summary = write(arguments.scene, arguments.output, options=options, progress=progress)
     with open_scene(arguments.scene) as scene:
-        heard = scene.index.sound.camera if scene.index.sound else ""
+        heard = scene.index.heard
     facts = {"file": str(arguments.output), "codec": arguments.codec, "crf": arguments.crf, "exact": summary.exact}
     print_facts({**facts, **vars(summary), "sound_left_out": heard}, arguments.json, _atlas_text)
     return 0

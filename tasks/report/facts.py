@@ -344,7 +344,7 @@ def scene_figures(scene: Scene, *, verified: bool | None = None, problem: str = 
         tuple(segment.dynamic for segment in index.segments for _ in range(segment.frames)),
         verified,
         problem,
-        index.sound.camera if index.sound else "",
+        index.heard,
     )
 
 
