@@ -572,6 +572,13 @@ def _compress(command: argparse.ArgumentParser) -> None:
     known.add_argument(
         "--fitted-db", type=float, default=None, metavar="DB", help="PSNR of the scene against footage (taken for 30)"
     )
+    command.add_argument(
+        "--iterations",
+        type=int,
+        default=None,
+        metavar="N",
+        help="by which codes make up for what is left out, a segment (200); 0: quicker, and larger files",
+    )
     _seed(command)
     _output(command, "FILE", "scene file to write")
     _json(command)

@@ -5,26 +5,27 @@ from __future__ import annotations
 import hashlib
 import math
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from packuv.colour import lit
+from packuv.compress.judge import Judge
+from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import Steps
-from packuv.gaussians.segment import Segment
+from packuv.compress.views import Views
+from packuv.compress.weigh import pictures_of
 from packuv.metrics import decibels
 from packuv.progress import Progress, Ticks, no_progress
-from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import EncodeOptions, Scene, open_scene, write_scene
 from packuv.scene.header import COMPRESSION
 
-FRAMES, CAMERAS = 3, 12
-"""Of which pictures tell distortion, at most, spread evenly: 36 of them differ from all by some tenths of a decibel"""
 TRIALS = 14
+ITERATIONS = 200
+"""In which codes of a segment are moved"""
+AGAIN, CORRECTIONS = 4, 3
+"""Further passes from there, each of so many times fewer iterations, until the goal is met"""
 FINEST = 1e-10
 """Noise of the finest steps that are tried, mean squared error of each kind of code"""
 COARSEST = 0.03
@@ -32,6 +33,7 @@ LONGEST = {"psnr_db": -100.123, "psnr_held_out_db": -100.123, "loss_db": -100.12
 """Figures that take as many characters as any, in the header of trials"""
 RATIO_TOLERANCE, LOSS_TOLERANCE = 0.02, 0.03
 """Shares of the goal by which the result may stay on the safe side of it"""
+RATIO_SLOPE, LOSS_SLOPE = 0.35, 1.0
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,21 @@ class Goal:
         """
         return 10 * math.log10(1 + 10 ** ((self.fitted_db - psnr_db) / 10))
 
-    def told(self, ratio: float, loss_db: float) -> tuple[float, float, float]:
+    def told(self, found: Compressed) -> tuple[float, float, float]:
         """What the goal is about, the goal, and the share of it by which it may be missed on the safe side."""
         if self.ratio is not None:
-            return ratio, self.ratio, RATIO_TOLERANCE
+            return found.ratio, self.ratio, RATIO_TOLERANCE
         assert self.loss_db is not None
-        return loss_db, self.loss_db, LOSS_TOLERANCE
+        return found.loss_db, self.loss_db, LOSS_TOLERANCE
+
+    def prefers(self, one: Compressed, other: Compressed) -> bool:
+        """Of two that keep the goal: as small as asked for and nearer to the lossless one, or as near and smaller."""
+        return one.loss_db < other.loss_db if self.ratio is not None else one.bytes < other.bytes
+
+    @property
+    def slope(self) -> float:
+        """By which power of the noise what the goal is about grows, about."""
+        return RATIO_SLOPE if self.ratio is not None else LOSS_SLOPE
 
 
 @dataclass(frozen=True)
@@ -84,6 +95,8 @@ class Compressed:
     noise: float
     """Mean squared error that each kind of code was meant to add to pictures"""
     steps: Steps
+    rows: float
+    """Share of the rows of all segments that are still there"""
 
     @property
     def ratio(self) -> float:
@@ -95,54 +108,61 @@ def compress(
     target: Path,
     goal: Goal,
     *,
+    iterations: int = ITERATIONS,
     seed: int = 0,
     threads: int = 0,
     progress: Progress = no_progress,
 ) -> Compressed:
     """Write a smaller scene file of a lossless one; the same input gives the same bytes.
 
-    Distortion is that of the scene's own cameras, the lossless scene being the truth. Raises ValueError where the
-    scene is not lossless, or has no cameras; where no steps reach the goal, with what can be reached.
+    Distortion is that of the scene's own cameras, the lossless scene being the truth. `iterations` are those of each
+    segment in which codes are moved to make up for what is left out; with 0 they stay where they are. Raises
+    ValueError where the scene is not lossless, or has no cameras; where no steps reach the goal, with what can be
+    reached.
     """
+    if iterations < 0:
+        raise ValueError(f"iterations must be 0 or more, but are {iterations}")
     with open_scene(source, threads=threads) as scene:
-        work = _Work(scene, goal, seed, threads, progress)
+        _check_lossless(scene)
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".packuv-") as folder:
-            work.unpack(Path(folder))
-            noise = work.search()
-            return work.write(target, noise)
+            work = _Work(scene, goal, Path(folder), iterations, seed, threads, progress)
+            return work.write(target, work.search())
 
 
 class _Work:
     """One scene, whose steps are looked for."""
 
-    def __init__(self, scene: Scene, goal: Goal, seed: int, threads: int, progress: Progress) -> None:
-        _check_lossless(scene)
-        self._scene, self._goal, self._threads = scene, goal, threads
+    def __init__(
+        self, scene: Scene, goal: Goal, folder: Path, iterations: int, seed: int, threads: int, progress: Progress
+    ) -> None:
+        self._scene, self._goal, self._folder, self._threads = scene, goal, folder, threads
         self._judge = Judge(scene)
-        learned = self._judge.learned
-        self._ticks = Ticks(progress, len(learned) * len(self._judge.frames) + TRIALS + 1)
+        learned, segments = self._judge.learned, scene.index.segments
+        self._passes = [iterations] + [-(-iterations // AGAIN)] * CORRECTIONS if iterations else []
+        pictures = len(learned) * len(self._judge.frames) + sum(pictures_of(entry.frames) for entry in segments)
+        self._ticks = Ticks(progress, pictures + TRIALS + 1 + len(segments) * sum(self._passes) + len(self._passes) + 1)
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, seed=seed, ticks=self._ticks)
+        fitted = [camera for camera in scene.header.cameras if camera.name not in scene.header.held_out]
+        self._rows = Rows(scene, Views(fitted or learned), folder, seed=seed, ticks=self._ticks)
         self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
         self._sound = scene.sound()
-        self._folder = Path()
-        self._segments: list[Path] = []
 
-    def unpack(self, folder: Path) -> None:
-        """Segment files of the lossless scene, for all trials."""
-        self._folder = folder
-        for number in range(len(self._scene.index.segments)):
-            self._segments.append(folder / f"lossless{number}.npz")
-            self._scene.segment(number).save(self._segments[-1])
+    def search(self) -> Compressed:
+        """What is nearest to the goal on its safe side, its segments kept: no larger than asked for, no worse than
+        allowed. Codes as they are tell about where that is, moved ones where exactly."""
+        best = self._trial(self._bisect())
+        self._rows.keep()
+        return self._tune(best)
 
-    def search(self) -> float:
-        """The noise that is nearest to the goal on its safe side: no larger than asked for, no worse than allowed."""
+    def _bisect(self) -> float:
+        """The noise that is nearest to the goal on its safe side, codes being as they are."""
         coarse, fine = self._trial(COARSEST), self._trial(FINEST)
         self._check_reach(fine, coarse)
         low, high = math.log(FINEST), math.log(COARSEST)
         safe = COARSEST if self._goal.ratio is not None else FINEST
         for _ in range(TRIALS - 2):
             middle = math.exp((low + high) / 2)
-            found, wanted, tolerance = self._goal.told(*_figures(self._trial(middle)))
+            found, wanted, tolerance = self._goal.told(self._trial(middle))
             if found > wanted:
                 high = math.log(middle)
             else:
@@ -153,8 +173,26 @@ class _Work:
                     break
         return safe
 
+    def _tune(self, best: Compressed) -> Compressed:
+        """The best of it and some trials with codes moved, each from where the last one left them."""
+        noise, tried = best.noise, list[tuple[float, float]]()
+        for iterations in self._passes:
+            trial = self._trial(noise, iterations)
+            found, wanted, tolerance = self._goal.told(trial)
+            if (found >= wanted) == (self._goal.ratio is not None):
+                if self._goal.prefers(trial, best):
+                    best = trial
+                    self._rows.keep()
+                if abs(found - wanted) <= tolerance * wanted:
+                    break
+            tried.append((math.log(noise), math.log(max(found, 1e-9))))
+            aim = wanted * (1 + tolerance / 2 if self._goal.ratio is not None else 1 - tolerance / 2)
+            noise = math.exp(_ahead(tried, math.log(aim), self._goal.slope))
+            noise = min(max(noise, FINEST), COARSEST)
+        return best
+
     def _check_reach(self, fine: Compressed, coarse: Compressed) -> None:
-        (least, wanted, _), (most, _, _) = (self._goal.told(*_figures(trial)) for trial in (fine, coarse))
+        (least, wanted, _), (most, _, _) = (self._goal.told(trial) for trial in (fine, coarse))
         if least < wanted <= most:
             return
         what = "{:.2f} to {:.2f} times smaller" if self._goal.ratio is not None else "worse by {:.3f} to {:.2f} dB"
@@ -164,42 +202,40 @@ class _Work:
             "between"
         )
 
-    def write(self, target: Path, noise: float) -> Compressed:
-        """The file itself, whose header says what was done to it."""
-        found = self._trial(noise)
+    def write(self, target: Path, found: Compressed) -> Compressed:
+        """The file itself, of the segments that were kept, whose header says what was done to them."""
         unseen = found.psnr_held_out_db and round(found.psnr_held_out_db, 3)
         figures = {
             "psnr_db": round(found.psnr_db, 3),
             "psnr_held_out_db": unseen,
             "loss_db": round(found.loss_db, 4),
         }
-        size = self._encode(target, found.steps, figures)
+        size = self._encode(target, self._rows.best, found.steps, found.rows, figures)
         self._ticks.advance()
         return replace(found, bytes=size)
 
-    def _trial(self, noise: float) -> Compressed:
+    def _trial(self, noise: float, iterations: int = 0) -> Compressed:
         """Write and look at a file of this noise, as long as the one that says what was found."""
         steps = Steps.of_noise(noise, self._sensitivity, self._scene.header.quantizer)
-        path = self._folder / "trial.mkv"
-        size = self._encode(path, steps, LONGEST)
+        path, segments = self._folder / "trial.mkv", self._rows.coarse(noise, steps, iterations)
+        rows = self._rows.kept / self._rows.count
+        size = self._encode(path, segments, steps, rows, LONGEST)
         error, unseen = self._judge.errors(path)
         self._ticks.advance()
         psnr_db = decibels(error)
         unseen_db = None if unseen is None else decibels(unseen)
         loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)
-        return Compressed(self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps)
+        return Compressed(self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps, rows)
 
-    def _encode(self, path: Path, steps: Steps, figures: Mapping[str, Any]) -> int:
-        """Write the scene in these steps, with these figures in its header; its size in bytes."""
-        coarse = [self._folder / f"coarse{number}.npz" for number in range(len(self._segments))]
-        for number, place in enumerate(coarse):
-            steps.segment(Segment.load(self._segments[number])).save(place)
-        options = EncodeOptions(steps.tolerance)
+    def _encode(
+        self, path: Path, segments: Sequence[Path], steps: Steps, rows: float, figures: Mapping[str, Any]
+    ) -> int:
+        """Write segments in these steps, with these figures in the header; the file's size in bytes."""
         header = self._scene.header
-        said = {**self._said(steps), **figures}
-        extra = {**header.extra, COMPRESSION: said}
+        extra = {**header.extra, COMPRESSION: {**self._said(steps), "rows": round(rows, 4), **figures}}
         stated = replace(header, quantizer=steps.quantizer(header.quantizer), extra=extra)
-        return write_scene(path, coarse, stated, sound=self._sound, options=options, threads=self._threads).bytes
+        options = EncodeOptions(steps.tolerance)
+        return write_scene(path, segments, stated, sound=self._sound, options=options, threads=self._threads).bytes
 
     def _said(self, steps: Steps) -> dict[str, Any]:
         """What the header says of how it was compressed, but for what was found."""
@@ -215,55 +251,13 @@ class _Work:
         }
 
 
-class Judge:
-    """Pictures of a scene, to which those of others are compared."""
-
-    def __init__(self, scene: Scene) -> None:
-        header = scene.header
-        held_out = [camera for camera in header.cameras if camera.name in header.held_out]
-        fitted = [camera for camera in header.cameras if camera.name not in header.held_out]
-        unseen = _spread(held_out, CAMERAS // 3 if fitted else CAMERAS)
-        self.learned = _spread(fitted, CAMERAS - len(unseen)) or unseen
-        """Cameras from which sensitivity is learned"""
-        self.cameras = tuple(self.learned) + tuple(camera for camera in unseen if camera not in self.learned)
-        self.frames = tuple(_spread(range(len(scene)), FRAMES))
-        self._unseen = {camera.name for camera in self.cameras} - {camera.name for camera in self.learned}
-        self._options, self._arena = RasterOptions(near=header.near), Arena()
-        self._truth = {(frame, name): picture for frame, name, picture in self._pictures(scene)}
-
-    def errors(self, path: Path) -> tuple[float, float | None]:
-        """Mean squared error of a scene file's pictures, and of those of cameras from which nothing was learned."""
-        wrong = [
-            (unseen, float(np.square(picture - truth, dtype=np.float64).mean()))
-            for unseen, picture, truth in self.pairs(path)
-        ]
-        others = [error for unseen, error in wrong if unseen]
-        return float(np.mean([error for _, error in wrong])), float(np.mean(others)) if others else None
-
-    def pairs(self, path: Path) -> Iterator[tuple[bool, np.ndarray, np.ndarray]]:
-        """Whether nothing was learned from the camera, a scene file's picture and the true one, float32 [3, H, W]."""
-        with open_scene(path) as scene:
-            for frame, name, picture in self._pictures(scene):
-                yield name in self._unseen, picture, self._truth[frame, name]
-
-    def _pictures(self, scene: Scene) -> Iterator[tuple[int, str, np.ndarray]]:
-        """Frame, camera, and float32 [3, H, W] as a display shows it in the light of the instant."""
-        for frame in self.frames:
-            gaussians = scene.gaussians(frame)
-            for camera in self.cameras:
-                drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
-                yield frame, camera.name, np.clip(lit(drawn, scene.light(frame)), 0, 1).astype(np.float32)
-
-
-def _figures(found: Compressed) -> tuple[float, float]:
-    return found.ratio, found.loss_db
-
-
-def _spread(items: Sequence[Any], count: int) -> list[Any]:
-    """`count` of the items at equal distances; all of them if there are fewer."""
-    if count >= len(items):
-        return list(items)
-    return [items[(2 * place + 1) * len(items) // (2 * count)] for place in range(count)]
+def _ahead(tried: Sequence[tuple[float, float]], aim: float, slope: float) -> float:
+    """Where a straight line through the last two points meets the aim, or one of this slope through the last."""
+    (x, y), before = tried[-1], tried[-2:-1]
+    if before and x != before[0][0]:
+        steep = (y - before[0][1]) / (x - before[0][0])
+        slope = min(max(steep, slope / 3), 3 * slope)
+    return x + (aim - y) / slope
 
 
 def _check_lossless(scene: Scene) -> None:

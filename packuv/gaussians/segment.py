@@ -56,6 +56,11 @@ class Segment:
         attributes[self.dynamic] = self.attributes[index - 1]
         return Codes(xyz, attributes)
 
+    def only(self, rows: np.ndarray) -> Segment:
+        """The same frames of these rows, bool [N]."""
+        moving = rows[self.dynamic]
+        return Segment(self.first, self.key[rows], self.dynamic[rows], self.xyz[:, moving], self.attributes[:, moving])
+
     def save(self, path: Path) -> None:
         np.savez(
             path,

@@ -45,6 +45,7 @@ def command(arguments: argparse.Namespace) -> int:
         "fitted_db_from": "given" if arguments.fitted_db is not None else "capture" if filmed else "assumed",
         "position_steps": (found.steps.position * found.steps.multiple).tolist(),
         "attribute_steps": found.steps.attribute.tolist(),
+        "rows": found.rows,
     }
     if filmed:
         facts["filmed"] = {"lossless": filmed, "compressed": scores}
@@ -59,14 +60,17 @@ def _search(
 
     Raises ValueError where no search reaches that; then nothing is written.
     """
-    from packuv.compress import compress
+    from packuv.compress import ITERATIONS, compress
 
+    tuned = ITERATIONS if arguments.iterations is None else arguments.iterations
     asked, lost, place = goal.loss_db, 0.0, partial_path(arguments.output, ".mkv")
     try:
         for number in range(SEARCHES):
             try:
                 with shown(arguments, "compress") as progress:
-                    found = compress(arguments.scene, place, goal, seed=arguments.seed, progress=progress)
+                    found = compress(
+                        arguments.scene, place, goal, iterations=tuned, seed=arguments.seed, progress=progress
+                    )
             except ValueError:
                 if number:  # no steps are so fine
                     break
@@ -101,6 +105,7 @@ def _text(facts: Mapping[str, Any]) -> str:
     lines = [
         f"{facts['file']}: {size_text(facts['bytes'])}, {facts['ratio']:.2f} times smaller than the lossless "
         f"{size_text(facts['source_bytes'])}",
+        f"gaussians  {facts['rows']:.1%} are still there; the others were hardly seen",
         f"pictures   {facts['psnr_db']:.2f} dB to those of the lossless scene{held_out}",
         f"loss       {facts['loss_db']:.3f} dB of {facts['fitted_db']:.2f} dB against footage "
         f"({source[facts['fitted_db_from']]}), by these pictures",

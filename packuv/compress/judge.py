@@ -1,0 +1,63 @@
+"""Pictures that tell how far a compressed scene is from the lossless one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from packuv.colour import lit
+from packuv.raster import Arena, RasterOptions, render
+from packuv.scene import Scene, open_scene
+
+FRAMES, CAMERAS = 3, 12
+"""Of which pictures tell distortion, at most, spread evenly: 36 of them differ from all by some tenths of a decibel"""
+
+
+class Judge:
+    """Pictures of a scene, to which those of others are compared."""
+
+    def __init__(self, scene: Scene) -> None:
+        header = scene.header
+        held_out = [camera for camera in header.cameras if camera.name in header.held_out]
+        fitted = [camera for camera in header.cameras if camera.name not in header.held_out]
+        unseen = _spread(held_out, CAMERAS // 3 if fitted else CAMERAS)
+        self.learned = _spread(fitted, CAMERAS - len(unseen)) or unseen
+        """Cameras from which sensitivity is learned"""
+        self.cameras = tuple(self.learned) + tuple(camera for camera in unseen if camera not in self.learned)
+        self.frames = tuple(_spread(range(len(scene)), FRAMES))
+        self._unseen = {camera.name for camera in self.cameras} - {camera.name for camera in self.learned}
+        self._options, self._arena = RasterOptions(near=header.near), Arena()
+        self._truth = {(frame, name): picture for frame, name, picture in self._pictures(scene)}
+
+    def errors(self, path: Path) -> tuple[float, float | None]:
+        """Mean squared error of a scene file's pictures, and of those of cameras from which nothing was learned."""
+        wrong = [
+            (unseen, float(np.square(picture - truth, dtype=np.float64).mean()))
+            for unseen, picture, truth in self.pairs(path)
+        ]
+        others = [error for unseen, error in wrong if unseen]
+        return float(np.mean([error for _, error in wrong])), float(np.mean(others)) if others else None
+
+    def pairs(self, path: Path) -> Iterator[tuple[bool, np.ndarray, np.ndarray]]:
+        """Whether nothing was learned from the camera, a scene file's picture and the true one, float32 [3, H, W]."""
+        with open_scene(path) as scene:
+            for frame, name, picture in self._pictures(scene):
+                yield name in self._unseen, picture, self._truth[frame, name]
+
+    def _pictures(self, scene: Scene) -> Iterator[tuple[int, str, np.ndarray]]:
+        """Frame, camera, and float32 [3, H, W] as a display shows it in the light of the instant."""
+        for frame in self.frames:
+            gaussians = scene.gaussians(frame)
+            for camera in self.cameras:
+                drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
+                yield frame, camera.name, np.clip(lit(drawn, scene.light(frame)), 0, 1).astype(np.float32)
+
+
+def _spread(items: Sequence[Any], count: int) -> list[Any]:
+    """`count` of the items at equal distances; all of them if there are fewer."""
+    if count >= len(items):
+        return list(items)
+    return [items[(2 * place + 1) * len(items) // (2 * count)] for place in range(count)]

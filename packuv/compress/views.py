@@ -1,0 +1,45 @@
+"""Cameras that look at a scene as its own do, and from between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from packuv.camera import PinholeCamera
+
+NEIGHBOURS = 3
+"""Of a camera, towards which others are imagined"""
+OWN = 0.3
+"""Share of the scene's own cameras among those drawn"""
+LEAST, MOST = -0.3, 0.6
+"""Of the way from a camera to its neighbour: a little beyond the rig's end, and past the middle"""
+
+
+class Views:
+    """Cameras of a scene, and more between and beside them: who never looks from elsewhere fits what he sees alone."""
+
+    def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
+        centres = np.array([camera.centre for camera in cameras])
+        apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+        self._cameras = tuple(cameras)
+        self._near = np.argsort(apart, axis=1, kind="stable")[:, 1 : 1 + NEIGHBOURS]
+
+    def draw(self, rng: np.random.Generator) -> PinholeCamera:
+        """One of them, by chance."""
+        index, own = rng.integers(len(self._cameras)), rng.random() < OWN
+        camera, near = self._cameras[index], self._near[index]
+        if own or not len(near):
+            return camera
+        return _between(camera, self._cameras[near[rng.integers(len(near))]], rng.uniform(LEAST, MOST))
+
+
+def _between(a: PinholeCamera, b: PinholeCamera, share: float) -> PinholeCamera:
+    """Optics of the first, standing and turned a share of the way towards the second."""
+    turns = [camera.camera_from_world[:3, :3] for camera in (a, b)]
+    left, _, right = np.linalg.svd((1 - share) * turns[0] + share * turns[1])
+    pose = np.eye(4)
+    pose[:3, :3] = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    pose[:3, 3] = -pose[:3, :3] @ ((1 - share) * a.centre + share * b.centre)
+    return replace(a, camera_from_world=pose)

@@ -1,0 +1,55 @@
+"""How much of a picture each Gaussian of a segment makes up at most, and who is therefore left out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from packuv.compress.views import Views
+from packuv.gaussians.codes import OPACITY, Quantizer
+from packuv.gaussians.segment import Segment
+from packuv.progress import Ticks
+from packuv.raster import Arena, RasterOptions, render
+
+FRAMES, VIEWS = 8, 8
+"""Of a segment, at most, spread evenly; and in each of them"""
+WORTH = 4e5
+"""Of a picture, in noise a Gaussian: what stays must make up so much of one. Measured, docs/compression.md"""
+
+
+def weigh(
+    segment: Segment, quantizer: Quantizer, views: Views, *, near: float, rng: np.random.Generator, ticks: Ticks
+) -> np.ndarray:
+    """Largest share of a picture that each row makes up, float32 [N]: its blending weights over the pixels.
+
+    Infinite where a row is in none of the frames that were drawn: nothing is known of it.
+    """
+    most, known = np.zeros(len(segment.key), np.float32), np.zeros(len(segment.key), bool)
+    options, arena = RasterOptions(near=near), Arena()
+    for index in _spread(len(segment)):
+        codes = segment.frame(index)
+        gaussians = quantizer.decode(codes)
+        known |= codes.attributes[:, OPACITY] > 0
+        for _ in range(VIEWS):
+            camera = views.draw(rng)
+            drawn = render(gaussians, camera, options=options, weights=True, arena=arena)
+            most = np.maximum(most, drawn.weights / (camera.width * camera.height))
+            ticks.advance()
+    return np.where(known, most, np.float32(np.inf))
+
+
+def pictures_of(frames: int) -> int:
+    """How many pictures `weigh` draws of a segment with so many frames."""
+    return VIEWS * len(_spread(frames))
+
+
+def _spread(frames: int) -> list[int]:
+    """The first frame, the last, and some between."""
+    return sorted({int(index) for index in np.linspace(0, frames - 1, FRAMES).round()})
+
+
+def worth(weights: np.ndarray, noise: float) -> np.ndarray:
+    """Rows that stay where kinds of codes add so much noise for each row, bool [N]; at least one.
+
+    Noise adds up over the rows, and so does what is left out: a row is worth its bits by its share of the noise.
+    """
+    return np.asarray((weights >= WORTH * noise) | (weights == weights.max()))
