@@ -19,7 +19,7 @@ def lossless(tmp_path_factory):
 
 def test_info_and_verify_know_a_compressed_scene(lossless, tmp_path, capsys):
     small = tmp_path / "small.mkv"
-    assert main(["compress", str(lossless), "--ratio", "1.8", "-o", str(small), "--json"]) == 0
+    assert main(["compress", str(lossless), "--ratio", "1.8", "--iterations", "20", "-o", str(small), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["bytes"] == small.stat().st_size
     assert main(["info", str(small), "--json"]) == 0
@@ -35,7 +35,15 @@ def test_info_and_verify_know_a_compressed_scene(lossless, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "goal", [[], ["--ratio", "2", "--loss-db", "1"], ["--ratio", "0.5"], ["--ratio", "1000"], ["--loss-db", "nan"]]
+    "goal",
+    [
+        [],
+        ["--ratio", "2", "--loss-db", "1"],
+        ["--ratio", "0.5"],
+        ["--ratio", "1000"],
+        ["--loss-db", "nan"],
+        ["--ratio", "2", "--iterations", "-1"],
+    ],
 )
 def test_goals_that_cannot_be_are_refused(lossless, tmp_path, goal, capsys):
     assert main(["compress", str(lossless), *goal, "-o", str(tmp_path / "small.mkv")]) == 2
@@ -56,6 +64,7 @@ def test_the_loss_that_footage_shows_is_what_was_asked_for_at_most(
     monkeypatch.setattr(compress, "_scores", scores)
     small = tmp_path / "small.mkv"
     words = ["compress", str(lossless), "--loss-db", "0.5", "--capture", str(tmp_path), "-o", str(small), "--json"]
+    words += ["--iterations", "10"]
     assert main(words) == code
     said = capsys.readouterr()
     if code:
