@@ -91,7 +91,7 @@ def forecast_of(row: Mapping[str, Any], options: SequenceOptions) -> Forecast:
 def size_from(data: Mapping[str, Any]) -> Size:
     """Inverse of `dataclasses.asdict`, through JSON."""
     fitted, held_out = (tuple((width, height) for width, height in data[name]) for name in ("fitted", "held_out"))
-    return Size(data["frames"], fitted, held_out, data.get("solved", False))
+    return Size(data["frames"], fitted, held_out, data.get("solved", False), data.get("lenses", False))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

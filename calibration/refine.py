@@ -44,7 +44,7 @@ class RefineOptions:
     sure: float = 4.0
     """Standard errors by which the gain must differ from none, in each half"""
     far: float = 0.02
-    """A camera that moves by more than this share of the rig's radius is a finding ..."""
+    """A camera of a given rig that moves by more than this share of the rig's radius is a finding ..."""
     far_deg: float = 1.0
     """... and one that turns by more than this"""
     unsure: float = 0.01

@@ -22,12 +22,13 @@ from pipelines.forecast import (
     Forecast,
     Machine,
     Size,
+    again_seconds,
+    attempts,
     forecast,
-    instants_more_seconds,
-    is_solved,
     machine_of,
     minutes_text,
     question_of,
+    with_rig,
 )
 from pipelines.options import SequenceOptions
 from pipelines.process import There, find_sequence, jobs_at_once, jobs_of, options_of, plan_of, points_of, walk
@@ -129,7 +130,7 @@ def look_ahead(request: RunRequest, *, progress: Progress = no_progress) -> Ahea
         size,
         tuple(_steps(expected, made, Store(root))),
         tuple(dict.fromkeys([*_spared(capture, plan, options, size), *_skips(journal.events)])),
-        tuple(_unknown(capture, options, size, machine, request.target_psnr is not None)),
+        tuple(_unknown(options, size, machine, request.target_psnr is not None)),
         expected,
         machine.probe.moving,
         root,
@@ -179,7 +180,7 @@ def _placed(size: Size, groups: Path, request: RunRequest, capture: Capture, pla
     """Raises what a run would of this calibration and these videos."""
     if request.stop_after != "sync":
         check_given(capture.calibration, groups, tuple(plan.videos), plan.first)
-    return replace(size, solved=is_solved(capture))
+    return with_rig(size, capture)
 
 
 @contextmanager
@@ -251,16 +252,25 @@ def _skips(events: Sequence[Event]) -> Iterator[tuple[str, str]]:
     yield from ((event.label, event.reason) for event in events if event.outcome == "skipped")
 
 
-def _unknown(capture: Capture, options: SequenceOptions, size: Size, machine: Machine, pilots: bool) -> Iterator[str]:
+def _unknown(options: SequenceOptions, size: Size, machine: Machine, pilots: bool) -> Iterator[str]:
     if (size.lender or size).solved:
-        given = (find_lender(capture) or capture).calibration
-        known = ", of which the lenses alone are known," if given else ""
-        more = minutes_text(instants_more_seconds(size, options, machine) / 60)
-        yield (
-            f"the cameras{known} have to be solved by COLMAP, which is counted as from one instant of pictures full of "
-            f"features; where that does not place all, it takes {more} more"
-        )
+        yield _solve_told(size.lender or size, options, machine)
     if options.motion.backend is MotionBackend.RAFT:
         yield "optical flow by RAFT takes half a second to seconds a picture more without a GPU"
     if pilots:
         yield "pilots of --target-psnr"
+
+
+def _solve_told(size: Size, options: SequenceOptions, machine: Machine) -> str:
+    """How a solve is counted, and what it takes where that does not suffice."""
+    known = ", of which the lenses alone are known," if size.lenses else ""
+    first, then = attempts(size, options)
+    instants = "one instant" if first == 1 else f"{first} instants"
+    counted = (
+        f"the cameras{known} have to be solved by COLMAP, which is counted as from {instants} of pictures full of "
+        "features"
+    )
+    if first == then:
+        return counted
+    more = minutes_text(again_seconds(size, options, machine) / 60)
+    return f"{counted}; where {'these do' if first > 1 else 'that does'} not place all, it takes {more} more"

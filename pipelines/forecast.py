@@ -112,6 +112,8 @@ class Size:
     """Likewise, of those to score on"""
     solved: bool = False
     """Whether nothing says where the cameras stand"""
+    lenses: bool = False
+    """Whether their lenses are known then"""
     lender: Size | None = None
     """Of the take whose rig this one uses, where that rig is still to be made"""
 
@@ -199,7 +201,7 @@ def size_of(capture: Capture, plan: Plan) -> Size:
     """Of what a plan means to process; reads the videos' packets. Raises what `probe_video` raises."""
     videos = probe_capture(capture, listen=False)
     told = {name: (video.width, video.height, video.frame_count) for name, video in videos.items()}
-    return replace(size_told(told, plan), solved=is_solved(capture))
+    return with_rig(size_told(told, plan), capture)
 
 
 def size_told(videos: Mapping[str, tuple[int, int, int]], plan: Plan) -> Size:
@@ -212,11 +214,12 @@ def size_told(videos: Mapping[str, tuple[int, int, int]], plan: Plan) -> Size:
     return Size(frames, tuple(sides[name] for name in plan.fitted), tuple(sides[name] for name in plan.held_out))
 
 
-def is_solved(capture: Capture) -> bool:
-    """Whether nothing says where the cameras stand, also of the take whose rig this one uses. Raises ValueError for a
+def with_rig(size: Size, capture: Capture) -> Size:
+    """With what is known of where the cameras stand, also of the take whose rig this one uses. Raises ValueError for a
     calibration/ that holds none, and what `find_lender` raises."""
     given = (find_lender(capture) or capture).calibration
-    return given is None or holds_lenses_alone(given)
+    lenses = given is not None and holds_lenses_alone(given)
+    return replace(size, solved=given is None or lenses, lenses=lenses)
 
 
 def fit_size(size: Size, options: SequenceOptions) -> FitSize:
@@ -294,23 +297,33 @@ def _pictures(size: Size) -> int:
 
 
 def _solving(size: Size, options: SequenceOptions) -> dict[str, float]:
-    """Of a solve from one instant: Mpx, pairs of pictures with `REFERENCE_FEATURES` each, and cameras to place."""
+    """Of a solve, as far as its first attempt."""
+    return _attempt(size, options, attempts(size, options)[0])
+
+
+def _attempt(size: Size, options: SequenceOptions, instants: int) -> dict[str, float]:
+    """Of a solve from so many: Mpx, pairs of pictures with `REFERENCE_FEATURES` each, and cameras to place."""
     sides, most = size.fitted + size.held_out, options.rig.solve.features.max_features
     pixels, count = sum(width * height for width, height in sides) * size.solved, len(sides) * size.solved
     features = min(most, FEATURES * pixels / max(1, count))
     pairs = count * (count - 1) / 2 if count <= ALL_PAIRS else count * PARTNERS
     return {
-        "features": pixels / 1e6,
-        "pairs": pairs * (features / REFERENCE_FEATURES) ** 2,
+        "features": instants * pixels / 1e6,
+        "pairs": instants * pairs * (features / REFERENCE_FEATURES) ** 2,
         "placing": count,
     }
 
 
-def instants_more_seconds(size: Size, options: SequenceOptions, machine: Machine) -> float:
-    """What a solve takes on top where one instant does not place all cameras and it looks at more."""
-    work = _solving(size, options)
-    once = sum(SECONDS[kind] * work[kind] for kind in ("features", "pairs"))
-    return machine.pace * (once * options.rig.more_instants + SECONDS["placing"] * work["placing"])
+def attempts(size: Size, options: SequenceOptions) -> tuple[int, int]:
+    """Instants that a solve looks at, and those that it tries where they do not place all cameras."""
+    several = min(options.rig.more_instants, size.frames)
+    return (several, 1) if size.lenses else (1, several)
+
+
+def again_seconds(size: Size, options: SequenceOptions, machine: Machine) -> float:
+    """What a solve takes on top where its first attempt does not place all cameras."""
+    work = _attempt(size, options, attempts(size, options)[1])
+    return machine.pace * sum(SECONDS[kind] * work[kind] for kind in work)
 
 
 def forecast(size: Size, options: SequenceOptions, machine: Machine, stop_after: str = STAGES[-1]) -> Forecast:

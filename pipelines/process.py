@@ -27,11 +27,11 @@ from pipelines.forecast import (
     Guess,
     Machine,
     forecast,
-    is_solved,
     machine_of,
     question_of,
     size_of,
     size_told,
+    with_rig,
 )
 from pipelines.ladder import up_to
 from pipelines.lender import lender_of
@@ -209,8 +209,7 @@ def foresee(run: Run, journal: Journal, expected: list[Forecast], groups: Key) -
     jobs, folder = run.workshop.jobs, run.workshop.store.root.parent
     videos = read_videos(run.workshop.path(groups))
     told = {name: (video["width"], video["height"], video["frames"]) for name, video in videos.items()}
-    size, at_once = size_told(told, run.plan), jobs_at_once(run.request)
-    size = replace(size, solved=is_solved(run.workshop.capture))
+    size, at_once = with_rig(size_told(told, run.plan), run.workshop.capture), jobs_at_once(run.request)
     question = question_of(run.plan, size, (run.options,))
     rough = forecast(size, run.options, Machine(Guess(), at_once), run.request.stop_after)
     if rough.minutes < WORTH_MINUTES and remembered(folder, question, jobs) is None:

@@ -183,9 +183,10 @@ class BorrowRig(Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class SolveRig(Stage):
-    """Solve the rig, from one instant, and from several if that fails: rig.json, check.json, matches.json."""
+    """Solve the rig, from one instant or from several, and the other way if that fails: rig.json, check.json,
+    matches.json."""
 
-    name, version = "rig", 3
+    name, version = "rig", 4
     take: Take
     """All cameras, as filmed"""
     first: int
@@ -196,26 +197,13 @@ class SolveRig(Stage):
 
     def build(self, work: Work) -> Notes:
         footage, options = Footage(self.take, work.site), self.options
-        instants = complete_instants(footage.load_groups(), self.take.cameras, self.first)
         lenses = self._load_lenses(footage, work) if self.lenses.sha256 else None
-        rigs, shots, problem = list[Rig](), list[Mapping[str, np.ndarray]](), None
-        for chosen in _attempts(instants, options.more_instants):
-            work.progress(0, 1, f"COLMAP, {len(chosen)} instant{'s' * (len(chosen) > 1)}")
-            shots = [footage.filmed(instant) for instant in chosen]
-            pictures = {name: [shot[name] for shot in shots] for name in self.take.cameras}
-            try:
-                rigs.append(solve_rig(pictures, options.solve, work.scratch, lenses=lenses))
-            except ValueError as error:
-                problem = error
-            if rigs and len(rigs[-1].cameras) == len(self.take.cameras):
-                break
-        if problem and not rigs:
-            raise problem
-        rig = max(rigs, key=lambda solved: len(solved.cameras))
+        rig, shots = self._solve(footage, lenses, work)
         kept = [name for name in self.take.cameras if name in rig.names]
         left = {name: LEFT_OUT for name in self.take.cameras if name not in kept}
         rig, done, swaying = rig.select(kept), None, dict[str, float]()
-        refining = replace(options.refining, adjust=SOLVED)
+        # Nobody gave places that it could differ from, so how far it moves is no news.
+        refining = replace(options.refining, adjust=SOLVED, far=math.inf, far_deg=math.inf)
         if options.refine or lenses is not None:
             work.progress(0, 1, "refining all cameras")
             levels = PLACES if lenses is not None else LEVELS
@@ -224,11 +212,32 @@ class SolveRig(Stage):
             work.progress(0, 1, "freeing the lenses")
             swaying = sway(rig, self._matches(rig, shots), options=refining)
         told = {name: _swaying(share) for name, share in swaying.items() if share > refining.swaying}
-        moved = done.told(refining) if done else {}
+        unsure = done.told(refining) if done else {}
         parts = {"refined": done.to_json() if done else None, "sway": swaying}
         evidence = {"source": rig.source, **{name: part for name, part in parts.items() if part}}
-        _save_rig(done.rig if done else rig, options, evidence, work.out, odd={**told, **moved, **left})
+        _save_rig(done.rig if done else rig, options, evidence, work.out, odd={**told, **unsure, **left})
         return {"source": "COLMAP", **_refined_notes(rig.source, done)}
+
+    def _solve(
+        self, footage: Footage, lenses: Rig | None, work: Work
+    ) -> tuple[Rig, Sequence[Mapping[str, np.ndarray]]]:
+        """The attempt that places most cameras, and the pictures that it was made from."""
+        instants = complete_instants(footage.load_groups(), self.take.cameras, self.first)
+        found, problems = list[tuple[Rig, Sequence[Mapping[str, np.ndarray]]]](), dict[int, ValueError]()
+        for chosen in _attempts(instants, self.options.more_instants, several_first=lenses is not None):
+            work.progress(0, 1, f"COLMAP, {len(chosen)} instant{'s' * (len(chosen) > 1)}")
+            shots = [footage.filmed(instant) for instant in chosen]
+            pictures = {name: [shot[name] for shot in shots] for name in self.take.cameras}
+            files = work.scratch / f"instants-{len(chosen)}"
+            try:
+                found.append((solve_rig(pictures, self.options.solve, files, lenses=lenses), shots))
+            except ValueError as error:
+                problems[len(chosen)] = error
+            if found and len(found[-1][0].cameras) == len(self.take.cameras):
+                break
+        if not found:
+            raise problems[max(problems)]  # that of several instants, since what one alone asks for is more of them
+        return max(found, key=lambda one: len(one[0].cameras))
 
     def _load_lenses(self, footage: Footage, work: Work) -> Rig:
         capture = find_capture(work.site.capture)
@@ -264,11 +273,15 @@ def _refined_notes(verdict: str, done: Refinement | None) -> Notes:
     return {"verdict": f"{verdict}; {done.reason}"}
 
 
-def _attempts(instants: np.ndarray, more: int) -> list[list[int]]:
-    """Instants to solve from: the first, then some spread over the recording."""
+def _attempts(instants: np.ndarray, more: int, *, several_first: bool) -> list[list[int]]:
+    """Instants to solve from: the first alone, and some spread over the recording. With known lenses these come before,
+    since their poses are nearer; else they cost more than they are sure to bring (docs/calibration.md)."""
+    first = [int(instants[0])]
     spread = instants[np.linspace(0, len(instants) - 1, more).round().astype(int)]
     several = sorted(set(spread.tolist()))
-    return [[int(instants[0])], several] if len(several) > 1 else [[int(instants[0])]]
+    if len(several) == 1:
+        return [first]
+    return [several, first] if several_first else [first, several]
 
 
 def find_rig(

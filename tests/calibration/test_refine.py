@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import combinations
 
@@ -88,6 +89,7 @@ def test_one_camera_that_is_far_off_is_named_and_the_others_stay_where_they_are(
     done = refine(wrong, matches(right), levels=PLACES)
     assert set(done.told(RefineOptions())) == {"cam3"}
     assert "was moved by" in done.told(RefineOptions())["cam3"]
+    assert done.told(RefineOptions(far=math.inf, far_deg=math.inf)) == {}  # as of a solve, which nobody gave places for
     centre, turn_deg, _ = errors(done.rig, right)  # the world is still that of the other cameras
     assert centre < 0.003
     assert turn_deg < 0.1

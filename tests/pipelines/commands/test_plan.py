@@ -229,8 +229,9 @@ def test_a_rig_that_is_to_be_solved_is_forecast_and_told(tmp_path, capsys):
     (least, told), (more, told_more), (_, told_lenses) = map(plan, (given, bare, known))
     assert least < more
     assert "solving the cameras" in told
-    assert any("cameras have to be solved by COLMAP" in text for text in told_more)
-    assert any("of which the lenses alone are known, have to be solved by COLMAP" in text for text in told_lenses)
+    counted = "have to be solved by COLMAP, which is counted as from"
+    assert any(f"cameras {counted} one instant " in text for text in told_more)
+    assert any(f"of which the lenses alone are known, {counted} 4 instants " in text for text in told_lenses)
 
 
 def test_a_sequence_that_its_run_would_refuse_does_not_stop_the_plan_of_the_others(tmp_path, capsys):

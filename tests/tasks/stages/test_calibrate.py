@@ -29,6 +29,7 @@ from tasks.stages.calibrate import (
     PointOptions,
     RigOptions,
     SolveRig,
+    _attempts,
     _KeptPictures,
     _lent,
     _moved,
@@ -131,6 +132,15 @@ def test_colours_that_gain_nothing_are_said(tmp_path):
     assert list(stage.spared(tmp_path, notes)) == [("lens shading", "shading does not pay"), ("colour of cam02", "few")]
     plain = {**notes, "balanced": False, "reason": "no need", "unlike": {}}
     assert list(stage.spared(tmp_path, plain)) == [("colour balance", "no need")]
+
+
+def test_a_solve_starts_from_several_instants_where_lenses_are_known_and_from_the_first_where_not():
+    instants = np.array([3, 4, 7, 8, 9, 12])
+    several = [3, 7, 8, 12]
+    assert _attempts(instants, 4, several_first=True) == [several, [3]]
+    assert _attempts(instants, 4, several_first=False) == [[3], several]
+    for few, more in ((instants[:1], 4), (instants, 1)):
+        assert _attempts(few, more, several_first=True) == _attempts(few, more, several_first=False) == [[3]]
 
 
 @pytest.mark.slow
