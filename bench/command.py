@@ -24,6 +24,7 @@ BENCHMARKS = (
     "masks",
     "mishaps",
     "motion",
+    "networks",
     "page",
     "pareto",
     "raster",

@@ -77,19 +77,21 @@ class _Table:
             "bytes": written.bytes,
             "track_bytes": dict(written.track_bytes),
             "bits_per_gaussian_and_frame": written.bytes * 8 / self.codes,
-            **self._distortion(file),
+            **distortion(self._judge, file),
         }
 
-    def _distortion(self, file: Path) -> dict[str, float | None]:
-        errors: dict[bool, list[float]] = {False: [], True: []}
-        alike = []
-        for unseen, picture, truth in self._judge.pairs(file):
-            errors[unseen].append(float(np.square(picture - truth, dtype=np.float64).mean()))
-            if unseen:
-                alike.append(ssim(picture, truth))
-        known = {"psnr_db": errors[False], "psnr_unseen_db": errors[True]}
-        levels = {name: _level(values) for name, values in known.items()}
-        return {**levels, "ssim_unseen": float(np.mean(alike)) if alike else None}
+
+def distortion(judge: Judge, file: Path) -> dict[str, float | None]:
+    """Of a scene file's pictures."""
+    errors: dict[bool, list[float]] = {False: [], True: []}
+    alike = []
+    for unseen, picture, truth in judge.pairs(file):
+        errors[unseen].append(float(np.square(picture - truth, dtype=np.float64).mean()))
+        if unseen:
+            alike.append(ssim(picture, truth))
+    known = {"psnr_db": errors[False], "psnr_unseen_db": errors[True]}
+    levels = {name: _level(values) for name, values in known.items()}
+    return {**levels, "ssim_unseen": float(np.mean(alike)) if alike else None}
 
 
 def _level(errors: Sequence[float]) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -27,8 +27,29 @@ def sensitivity(
     frames. For seeds z of +1 and -1 by pixel, one backward pass gives J^T z, whose squares have the sums over pixels
     of J's squares as their mean: one pass for each picture tells all.
     """
+    kinds, samples = np.zeros(3 + len(scene.header.quantizer.low)), 0
+    for squares, count in _squares(scene, cameras, frames, seed=seed, ticks=ticks):
+        kinds += squares.sum(axis=0)
+        samples += count
+    return kinds / samples
+
+
+def row_sensitivity(
+    scene: Scene, cameras: Sequence[PinholeCamera], frames: Sequence[int], *, seed: int = 0
+) -> np.ndarray:
+    """The same of each row, float64 [N, 3 + A], from frames of one segment."""
+    total, samples = np.zeros(0), 0
+    for squares, count in _squares(scene, cameras, frames, seed=seed):
+        total = total + squares if samples else squares
+        samples += count
+    return total / samples
+
+
+def _squares(
+    scene: Scene, cameras: Sequence[PinholeCamera], frames: Sequence[int], *, seed: int, ticks: Ticks | None = None
+) -> Iterator[tuple[np.ndarray, int]]:
+    """By picture: squared derivatives by the codes of each row [N, 3 + A], and how many values it has."""
     rng, options = np.random.default_rng(seed), RasterOptions(near=scene.header.near)
-    total, samples = np.zeros(3 + len(scene.header.quantizer.low)), 0
     for frame in frames:
         codes = scene.codes(frame)
         gaussians = scene.header.quantizer.decode(codes)
@@ -37,11 +58,9 @@ def sensitivity(
             seeds = rng.choice(np.array([-1, 1], np.float32), drawn.colour.shape)
             seeds[(drawn.colour < 0) | (drawn.colour > 1)] = 0  # what a display clips shows no error
             found = gradients(drawn, seeds)
-            total += np.square(by_code(found, gaussians, codes, scene.header.quantizer)).sum(axis=0)
-            samples += drawn.colour.size
+            yield np.square(by_code(found, gaussians, codes, scene.header.quantizer)), drawn.colour.size
             if ticks:
                 ticks.advance()
-    return total / samples
 
 
 def by_code(found: Gradients, gaussians: Gaussians, codes: Codes, quantizer: Quantizer) -> np.ndarray:

@@ -1,0 +1,106 @@
+"""Networks of the compression benchmark: what is stored comes back, coarser is smaller and worse, seeds decide."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from packuv.compress.by_row import MOST_RESIDUAL, PLACE, Key, RowSteps, as_bytes, differences, later, packet, summed
+from packuv.compress.networks import MOST_LATENT, Rows, neighbours, train
+from packuv.gaussians.codes import OPACITY, Codes, Quantizer
+from packuv.scene import open_scene, write_scene
+from packuv.scene.matroska import Encoder, VideoTrack
+from packuv.scene.mosaic import NEUTRAL
+from tests.support.small_scene import small_scene, small_segments
+
+COUNT, LATER, MOVING = 1000, 3, 200
+
+
+def synthetic(wide=1.0):
+    """Rows of four columns, of which two go together and all drift from neighbour to neighbour."""
+    rng = np.random.default_rng(1)
+    walk = np.cumsum(rng.normal(size=(COUNT, 2)), axis=0)
+    values = np.concatenate([walk, walk + rng.normal(size=(COUNT, 2))], axis=1) * 3 / wide
+    moving = values[:MOVING] + np.cumsum(rng.normal(size=(LATER, MOVING, 4)), axis=0) / wide
+    weights = np.ones((COUNT, 4), np.float32)
+    return Rows(values.astype(np.float32), weights, neighbours(COUNT), moving.astype(np.float32))
+
+
+def bits(latents):
+    """Order-0 entropy of what neighbours do not tell, a row."""
+    around = neighbours(COUNT)
+    left, above, corner = (latents[around[:, side]] for side in range(3))
+    residuals = latents - np.median([left, above, left + above - corner], axis=0)
+    shares = [np.unique(column, return_counts=True)[1] / COUNT for column in residuals.T]
+    return sum(-(share * np.log2(share)).sum() for share in shares)
+
+
+@pytest.mark.parametrize(("latents", "hidden"), [(4, 0), (4, 8)])
+def test_coarser_is_smaller_and_worse(latents, hidden):
+    points = []
+    for wide in (1.0, 4.0, 16.0):
+        rows = synthetic(wide)
+        transform = train(rows, latents, hidden=hidden, iterations=15)
+        found = transform.latents(rows.key)
+        points.append((bits(found), np.square((transform.values(found) - rows.key) * wide).mean()))
+        assert np.abs(found).max() <= MOST_LATENT
+    for (size, error), (next_size, next_error) in pairwise(points):
+        assert next_size < size
+        assert next_error > error
+
+
+def test_a_seed_is_a_network():
+    first, second, other = (train(synthetic(), 3, hidden=8, iterations=2, seed=seed) for seed in (1, 1, 2))
+    assert all(a.equal(b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
+    assert not all(a.equal(b) for a, b in zip(first.parameters(), other.parameters(), strict=True))
+
+
+def test_latents_come_back_from_a_scene_file(tmp_path):
+    rows = synthetic()
+    transform = train(rows, 4, hidden=8, iterations=2)
+    segment, attributes = small_segments()[0], np.full((COUNT, 10), NEUTRAL, np.uint8)
+    attributes[:, :4] = transform.latents(rows.key) + NEUTRAL
+    moving = np.full((LATER, MOVING, 10), NEUTRAL, np.uint8)
+    moving[..., :4] = transform.latents(rows.moving) + NEUTRAL
+    place, still = np.zeros((COUNT, 3), np.uint16), np.zeros((LATER, MOVING, 3), np.uint16)
+    stored = replace(
+        segment, key=Codes(place, attributes), dynamic=np.arange(COUNT) < MOVING, xyz=still, attributes=moving
+    )
+    with open_scene(small_scene(tmp_path / "small.mkv")) as scene:
+        quantizer = Quantizer(np.zeros(3), 1.0, np.ones(3), np.zeros(10), np.full(10, 255.0))
+        header = replace(scene.header, quantizer=quantizer).first(1 + LATER)
+    stored.save(tmp_path / "0.npz")
+    write_scene(tmp_path / "latents.mkv", [tmp_path / "0.npz"], header)
+    with open_scene(tmp_path / "latents.mkv") as scene:
+        found = scene.segment(0)
+    assert np.array_equal(found.key.attributes, attributes)
+    assert np.array_equal(found.attributes, moving)
+
+
+def test_readers_find_the_steps_of_each_row():
+    segment = small_segments()[0]
+    values = np.concatenate([segment.key.xyz, segment.key.attributes], axis=1).astype(np.float64)
+    squares = np.exp2(values[:, [PLACE + OPACITY]] / 32) * np.ones(values.shape[1])  # what shows more counts more
+    noise = 8**2 / 12 * squares.sum(axis=0).mean()  # steps of eight codes, on average
+    key = Key(RowSteps(values, squares, iterations=15, seed=0), len(values), noise)
+    residuals, decoded = key.residuals(values)
+    assert np.array_equal(key.values(residuals), decoded)
+    steps = key.steps(decoded)
+    reached = np.abs(residuals) < MOST_RESIDUAL  # colours side by side may differ by more than a byte of steps
+    assert (np.abs(values - decoded) <= steps / 2 + 0.51)[reached].all()  # and are then rounded to a code
+    opaque = values[:, PLACE + OPACITY] > np.median(values[:, PLACE + OPACITY])
+    assert steps[opaque, PLACE].mean() < steps[~opaque, PLACE].mean()
+    for _, found in later(segment, decoded, steps):
+        assert found.shape == (segment.xyz.shape[1], values.shape[1])
+
+
+def test_ffv1_codes_just_the_differences_it_is_given():
+    rng = np.random.default_rng(5)
+    picture = np.clip(rng.normal(NEUTRAL, 4, (128, 128)), 0, 255).astype(np.uint8)
+    assert np.array_equal(differences(summed(picture)), picture)
+    own, given = (Encoder(VideoTrack("noise", 128, 128, 4)).encode(each) for each in (picture, summed(picture)))
+    assert len(given) < 0.97 * len(own)
+    assert len(packet(as_bytes(np.zeros((900, 13), np.int64)))) < 200
