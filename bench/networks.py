@@ -28,9 +28,8 @@ import numpy as np
 
 from bench import command
 from bench.compression import RAW_BITS, distortion
-from packuv.compress.by_row import Key, RowSteps, as_bytes, later, packet
+from packuv.compress.judge import Judge
 from packuv.compress.networks import Rows, Transform, neighbours, train
-from packuv.compress.search import Judge
 from packuv.compress.sensitivity import row_sensitivity
 from packuv.compress.steps import MIDDLE, Steps
 from packuv.gaussians.codes import DC, OPACITY, Codes, Quantizer, attribute_count
@@ -44,9 +43,7 @@ UNSEEN = 6
 SHRUNK = 0.1
 """Share of the kind's mean in the weight of a row, which few pictures tell"""
 POSITION = slice(0, 3)
-WIDEST = 512.0
-"""Steps, codes: two of them are wider than any range"""
-LEARNED, ABOUT_MEAN, BY_ROW = "learned steps", "steps about the mean", "steps by row"
+LEARNED = "learned steps"
 
 
 @dataclass(frozen=True)
@@ -84,16 +81,10 @@ class _Bench:
         self._segment = scene.segment(0)
         self._squares = row_sensitivity(scene, self._judge.learned, self._judge.frames, seed=seed)
         self._around = neighbours(len(self._segment.key))
-        self._frame_bytes = 0
-        """Of a scene file, beside its packets"""
 
     def rows(self, noise: float, named: str) -> Iterator[dict[str, Any]]:
         """Of the table, of designs whose name holds `named`."""
         yield self.steps(noise)
-        if named in ABOUT_MEAN:
-            yield self.about_mean(noise)
-        if named in BY_ROW:
-            yield self.by_row(noise)
         for design in designs(self._squares.shape[1]):
             if named in design.name:
                 yield self.network(design, noise)
@@ -103,31 +94,7 @@ class _Bench:
         steps = self._learned(noise)
         header = replace(self._scene.header, quantizer=steps.quantizer(self._scene.header.quantizer))
         file = self._write(steps.segment(self._segment), header, steps.tolerance)
-        with open_scene(file) as scene:
-            self._frame_bytes = file.stat().st_size - sum(sum(track.sizes) for track in scene.index.tracks)
         return {"name": LEARNED, "noise": noise, **self._size(file, 0), **distortion(self._judge, file)}
-
-    def about_mean(self, noise: float) -> dict[str, Any]:
-        """Learned steps as wide as they come, of which one lies on the mean of its column, whatever the range is."""
-        steps, quantizer = self._learned(noise), self._scene.header.quantizer
-        columns = np.arange(len(quantizer.low))
-        wide = np.sqrt(12 * noise / self._squares.sum(axis=0))[POSITION.stop :]
-        wide = np.where(columns == OPACITY, steps.attribute, np.clip(wide, 1, WIDEST))
-        first = np.where(columns == OPACITY, 0, self._segment.key.attributes.mean(axis=0) - NEUTRAL * wide)
-        coarse = steps.segment(self._segment)
-
-        def about(xyz: np.ndarray, attributes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            codes = np.clip(np.rint((attributes - first) / wide), 0, 255).astype(np.uint8)
-            codes[..., OPACITY] = np.where(attributes[..., OPACITY] > 0, np.maximum(codes[..., OPACITY], 1), 0)
-            return xyz, codes
-
-        stored = _mapped(self._segment, about)
-        stored = replace(stored, key=Codes(coarse.key.xyz, stored.key.attributes), xyz=coarse.xyz)
-        unit = (quantizer.high - quantizer.low) / 255
-        low = quantizer.low + first * unit
-        ranges = replace(steps.quantizer(quantizer), low=low, high=low + 255 * wide * unit)
-        file = self._write(stored, replace(self._scene.header, quantizer=ranges), steps.tolerance)
-        return {"name": ABOUT_MEAN, "noise": noise, **self._size(file, 0), **distortion(self._judge, file)}
 
     def network(self, design: Design, noise: float) -> dict[str, Any]:
         """Trained, written, read and drawn."""
@@ -152,31 +119,6 @@ class _Bench:
         shown = distortion(self._judge, self._write(segment, self._scene.header, Tolerance()))
         times = {"train_seconds": trained, "decode_seconds_per_frame": seconds}
         return {"name": design.name, "noise": noise, **size, **shown, **times}
-
-    def by_row(self, noise: float) -> dict[str, Any]:
-        """Steps of each row's own. What is no packet is as large as in the file of learned steps."""
-        segment, started = self._segment, time.perf_counter()
-        values = np.concatenate([segment.key.xyz, segment.key.attributes], axis=1).astype(np.float64)
-        wide = np.maximum(np.sqrt(12 * noise / self._squares.sum(axis=0)), 1)
-        with one_torch_thread():
-            steps = RowSteps(np.rint(values / wide) * wide, self._squares, iterations=self._iterations, seed=self._seed)
-            trained, started = time.perf_counter() - started, time.perf_counter()
-            key = Key(steps, len(values), noise)
-            residuals, decoded = key.residuals(values)
-            absent = segment.key.attributes[:, OPACITY] == 0
-            size = self._frame_bytes + steps.bytes + len(packet(as_bytes(np.column_stack([residuals, absent]))))
-            moving = np.empty((len(segment) - 1, segment.xyz.shape[1], values.shape[1]))
-            for frame, (changed, found) in enumerate(later(segment, decoded, key.steps(decoded))):
-                size += len(packet(as_bytes(changed)))
-                moving[frame] = found
-            seconds = (time.perf_counter() - started) / len(segment)
-        xyz, attributes = _codes(moving, segment.attributes)
-        shown = replace(segment, key=Codes(*_codes(decoded, segment.key.attributes)), xyz=xyz, attributes=attributes)
-        written = self._write(shown, self._scene.header, Tolerance())
-        bits = size * 8 / (len(segment) * len(values))
-        return {"name": BY_ROW, "noise": noise, "bytes": size, "decoder_bytes": steps.bytes,
-                "bits_per_gaussian_and_frame": bits, **distortion(self._judge, written),
-                "train_seconds": trained, "code_seconds_per_frame": seconds}  # fmt: skip
 
     def _learned(self, noise: float) -> Steps:
         return Steps.of_noise(noise, self._squares.sum(axis=0), self._scene.header.quantizer)
@@ -298,23 +240,22 @@ def prepared(scene: Scene, folder: Path) -> dict[str, Path]:
 
 
 def smaller(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> float | None:
-    """Share that a row saves of what steps take for the same PSNR of unseen cameras, of the better kind of steps.
+    """Share that a row saves of what steps take for the same PSNR of unseen cameras.
 
     Between and beyond two neighbours of theirs the logarithm of size is taken as linear in dB.
     """
-    sizes = []
-    for name in (LEARNED, ABOUT_MEAN):
-        points = sorted(
-            (other["psnr_unseen_db"], np.log(other["bytes"]))
-            for other in rows
-            if other["name"] == name and other["frames"] == row["frames"]
-        )
-        if len(points) > 1 and row["name"] not in (LEARNED, ABOUT_MEAN):
-            level = row["psnr_unseen_db"]
-            first = min(max(sum(point[0] < level for point in points) - 1, 0), len(points) - 2)
-            (low, low_size), (high, high_size) = points[first : first + 2]
-            sizes.append(np.exp(low_size + (level - low) / (high - low) * (high_size - low_size)))
-    return 1 - row["bytes"] / min(sizes) if sizes else None
+    points = sorted(
+        (other["psnr_unseen_db"], np.log(other["bytes"]))
+        for other in rows
+        if other["name"] == LEARNED and other["frames"] == row["frames"]
+    )
+    if len(points) < 2 or row["name"] == LEARNED:
+        return None
+    level = row["psnr_unseen_db"]
+    first = min(max(sum(point[0] < level for point in points) - 1, 0), len(points) - 2)
+    (low, low_size), (high, high_size) = points[first : first + 2]
+    size = float(np.exp(low_size + (level - low) / (high - low) * (high_size - low_size)))
+    return 1 - float(row["bytes"]) / size
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

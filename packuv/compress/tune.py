@@ -70,11 +70,9 @@ def moved(codes: Codes, offsets: np.ndarray, steps: Steps) -> Codes:
     """Codes [N] with offsets [N, 3 + A] added, to the nearest; nobody comes or goes. Equal rows stay equal."""
     unit = _unit(steps, offsets.shape[1])
     shift = np.rint(offsets) * unit
-    there = codes.attributes[:, OPACITY] > 0
     xyz = np.clip(codes.xyz + shift[:, :3], 0, 65535).astype(np.uint16)
-    attributes = np.clip(codes.attributes + shift[:, 3:], 0, np.floor(255 / steps.attribute))
-    attributes[:, OPACITY] = np.where(there, np.maximum(attributes[:, OPACITY], 1), 0)
-    return Codes(xyz, attributes.astype(np.uint8))
+    there = codes.attributes[:, OPACITY] > 0
+    return Codes(xyz, steps.limited(codes.attributes + shift[:, 3:], there))
 
 
 def moved_segment(segment: Segment, offsets: np.ndarray, steps: Steps) -> Segment:

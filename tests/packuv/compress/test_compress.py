@@ -12,7 +12,7 @@ from packuv.compress import Goal, compress
 from packuv.compress.judge import Judge
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import MOST_ATTRIBUTE, Steps
-from packuv.gaussians.codes import OPACITY
+from packuv.gaussians.codes import OPACITY, REST, attribute_count
 from packuv.metrics import decibels
 from packuv.scene import EncodeOptions, Tolerance, open_scene, verify_scene, write_scene
 from tests.support.small_scene import small_quantizer, small_scene, small_segments
@@ -90,6 +90,25 @@ def test_steps_err_by_half_at_most_and_nobody_comes_or_goes(learned, noise):
     far = steps.position * (steps.multiple + (steps.multiple > 1)) * edge / 65535  # multiples lie half a code aside
     assert (np.abs(turned[0] - turned[1]) <= far + 1e-5).all()
     assert steps.attribute.max() <= MOST_ATTRIBUTE
+
+
+def test_bands_above_0_have_a_code_for_nothing_in_any_steps():
+    degree, count = 1, attribute_count(1)
+    low = np.append(small_quantizer().low, np.full(count - 10, -1.5))
+    quantizer = replace(small_quantizer(), low=low, high=-low, sh_degree=degree)
+    rng, there = np.random.default_rng(6), np.full((50, count), 200, np.uint8)
+    there[:, REST:] = rng.integers(0, 256, (50, count - REST))
+    there[:10, REST:] = 128  # as near to nothing as codes come
+    for noise in (1e-9, 1e-5, 1e-2):
+        steps = Steps.of_noise(noise, np.full(3 + count, 1e-6), quantizer)
+        found = steps.limited(np.rint((there - steps.first) / steps.attribute), there[:, OPACITY] > 0)
+        unit, wide = (high_low.high - high_low.low for high_low in (quantizer, steps.quantizer(quantizer)))
+        bands = steps.quantizer(quantizer).low + found * wide / 255
+        values = quantizer.low + there * unit / 255
+        assert (found[:10, REST:] == 128).all()
+        assert np.abs(bands[:10, REST:]).max() <= 1.5 / 255 + 1e-9
+        # A value at the end of its range may have no code above it.
+        assert (np.abs(bands - values)[:, REST:] <= (steps.attribute * unit / 255)[REST:] + 1e-9).all()
 
 
 def test_equal_rows_stay_equal(learned):

@@ -8,11 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from packuv.compress.by_row import MOST_RESIDUAL, PLACE, Key, RowSteps, as_bytes, differences, later, packet, summed
 from packuv.compress.networks import MOST_LATENT, Rows, neighbours, train
-from packuv.gaussians.codes import OPACITY, Codes, Quantizer
+from packuv.gaussians.codes import Codes, Quantizer
 from packuv.scene import open_scene, write_scene
-from packuv.scene.matroska import Encoder, VideoTrack
 from packuv.scene.mosaic import NEUTRAL
 from tests.support.small_scene import small_scene, small_segments
 
@@ -78,29 +76,3 @@ def test_latents_come_back_from_a_scene_file(tmp_path):
         found = scene.segment(0)
     assert np.array_equal(found.key.attributes, attributes)
     assert np.array_equal(found.attributes, moving)
-
-
-def test_readers_find_the_steps_of_each_row():
-    segment = small_segments()[0]
-    values = np.concatenate([segment.key.xyz, segment.key.attributes], axis=1).astype(np.float64)
-    squares = np.exp2(values[:, [PLACE + OPACITY]] / 32) * np.ones(values.shape[1])  # what shows more counts more
-    noise = 8**2 / 12 * squares.sum(axis=0).mean()  # steps of eight codes, on average
-    key = Key(RowSteps(values, squares, iterations=15, seed=0), len(values), noise)
-    residuals, decoded = key.residuals(values)
-    assert np.array_equal(key.values(residuals), decoded)
-    steps = key.steps(decoded)
-    reached = np.abs(residuals) < MOST_RESIDUAL  # colours side by side may differ by more than a byte of steps
-    assert (np.abs(values - decoded) <= steps / 2 + 0.51)[reached].all()  # and are then rounded to a code
-    opaque = values[:, PLACE + OPACITY] > np.median(values[:, PLACE + OPACITY])
-    assert steps[opaque, PLACE].mean() < steps[~opaque, PLACE].mean()
-    for _, found in later(segment, decoded, steps):
-        assert found.shape == (segment.xyz.shape[1], values.shape[1])
-
-
-def test_ffv1_codes_just_the_differences_it_is_given():
-    rng = np.random.default_rng(5)
-    picture = np.clip(rng.normal(NEUTRAL, 4, (128, 128)), 0, 255).astype(np.uint8)
-    assert np.array_equal(differences(summed(picture)), picture)
-    own, given = (Encoder(VideoTrack("noise", 128, 128, 4)).encode(each) for each in (picture, summed(picture)))
-    assert len(given) < 0.97 * len(own)
-    assert len(packet(as_bytes(np.zeros((900, 13), np.int64)))) < 200
