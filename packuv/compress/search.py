@@ -14,6 +14,7 @@ from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import Steps
+from packuv.compress.tune import DRAWN
 from packuv.compress.views import Views
 from packuv.compress.weigh import pictures_of
 from packuv.metrics import decibels
@@ -139,8 +140,11 @@ class _Work:
         self._judge = Judge(scene)
         learned, segments = self._judge.learned, scene.index.segments
         self._passes = [iterations] + [-(-iterations // AGAIN)] * CORRECTIONS if iterations else []
-        pictures = len(learned) * len(self._judge.frames) + sum(pictures_of(entry.frames) for entry in segments)
-        self._ticks = Ticks(progress, pictures + TRIALS + 1 + len(segments) * sum(self._passes) + len(self._passes) + 1)
+        self._pictures = len(self._judge.cameras) * len(self._judge.frames)
+        first = len(learned) * len(self._judge.frames) + sum(pictures_of(entry.frames) for entry in segments)
+        trials = self._pictures * (TRIALS + 1 + len(self._passes))
+        tuned = DRAWN * len(segments) * sum(self._passes)
+        self._ticks = Ticks(progress, first + trials + tuned + 1)
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, seed=seed, ticks=self._ticks)
         fitted = [camera for camera in scene.header.cameras if camera.name not in scene.header.held_out]
         self._rows = Rows(scene, Views(fitted or learned), folder, seed=seed, ticks=self._ticks)
@@ -221,7 +225,7 @@ class _Work:
         rows = self._rows.kept / self._rows.count
         size = self._encode(path, segments, steps, rows, LONGEST)
         error, unseen = self._judge.errors(path)
-        self._ticks.advance()
+        self._ticks.advance(self._pictures)
         psnr_db = decibels(error)
         unseen_db = None if unseen is None else decibels(unseen)
         loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)

@@ -18,6 +18,8 @@ from packuv.raster import Arena, RasterOptions, gradients, render
 
 RATE = 0.11
 """Steps by which an iteration moves a code whose gradient is that of its kind; in the second half less and less"""
+DRAWN = 4
+"""Pictures that take as long to draw as an iteration: it draws two, and goes back through one"""
 FADING, SQUARES_FADING = 0.9, 0.99
 """Of the last gradients and their squares in their means"""
 ALIKE = 10.0
@@ -62,7 +64,7 @@ def tune(
         scale += ALIKE * np.sqrt(squares.mean(axis=0) / near_now[1]) + 1e-30
         rate = RATE * ALIKE * min(1.0, 2 * (1 - iteration / iterations))
         offsets = offsets - np.where(free[:, None], rate * (mean / near_now[0]) / scale, 0)
-        ticks.advance()
+        ticks.advance(DRAWN)
     return offsets
 
 

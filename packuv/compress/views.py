@@ -21,15 +21,14 @@ class Views:
     """Cameras of a scene, and more between and beside them: who never looks from elsewhere fits what he sees alone."""
 
     def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
-        centres = np.array([camera.centre for camera in cameras])
-        apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
         self._cameras = tuple(cameras)
-        self._near = np.argsort(apart, axis=1, kind="stable")[:, 1 : 1 + NEIGHBOURS]
+        self._centres = np.array([camera.centre for camera in cameras])
 
     def draw(self, rng: np.random.Generator) -> PinholeCamera:
         """One of them, by chance."""
         index, own = rng.integers(len(self._cameras)), rng.random() < OWN
-        camera, near = self._cameras[index], self._near[index]
+        camera, apart = self._cameras[index], np.linalg.norm(self._centres - self._centres[index], axis=1)
+        near = np.argsort(apart, kind="stable")[1 : 1 + NEIGHBOURS]
         if own or not len(near):
             return camera
         return _between(camera, self._cameras[near[rng.integers(len(near))]], rng.uniform(LEAST, MOST))
