@@ -141,13 +141,15 @@ class _Work:
         learned, segments = self._judge.learned, scene.index.segments
         self._passes = [iterations] + [-(-iterations // AGAIN)] * CORRECTIONS if iterations else []
         self._pictures = len(self._judge.cameras) * len(self._judge.frames)
-        first = len(learned) * len(self._judge.frames) + sum(pictures_of(entry.frames) for entry in segments)
+        fitted = [camera for camera in scene.header.cameras if camera.name not in scene.header.held_out]
+        views = Views(fitted or learned)
+        first = len(learned) * len(self._judge.frames)
+        first += sum(pictures_of(entry.frames, len(views)) for entry in segments)
         trials = self._pictures * (TRIALS + 1 + len(self._passes))
         tuned = DRAWN * len(segments) * sum(self._passes)
         self._ticks = Ticks(progress, first + trials + tuned + 1)
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, seed=seed, ticks=self._ticks)
-        fitted = [camera for camera in scene.header.cameras if camera.name not in scene.header.held_out]
-        self._rows = Rows(scene, Views(fitted or learned), folder, seed=seed, ticks=self._ticks)
+        self._rows = Rows(scene, views, folder, seed=seed, ticks=self._ticks)
         self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
         self._sound = scene.sound()
 

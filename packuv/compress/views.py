@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,9 +24,23 @@ class Views:
         self._cameras = tuple(cameras)
         self._centres = np.array([camera.centre for camera in cameras])
 
+    def __len__(self) -> int:
+        """Number of the scene's own."""
+        return len(self._cameras)
+
     def draw(self, rng: np.random.Generator) -> PinholeCamera:
         """One of them, by chance."""
-        index, own = rng.integers(len(self._cameras)), rng.random() < OWN
+        return self._beside(int(rng.integers(len(self))), rng)
+
+    def sweep(self, count: int, rng: np.random.Generator) -> Iterator[PinholeCamera]:
+        """So many, by chance, but of each of the scene's own or beside it as many as of any other, or one more."""
+        for number in range(count):
+            if number % len(self) == 0:
+                order = rng.permutation(len(self))
+            yield self._beside(int(order[number % len(self)]), rng)
+
+    def _beside(self, index: int, rng: np.random.Generator) -> PinholeCamera:
+        own = rng.random() < OWN
         camera, apart = self._cameras[index], np.linalg.norm(self._centres - self._centres[index], axis=1)
         near = np.argsort(apart, kind="stable")[1 : 1 + NEIGHBOURS]
         if own or not len(near):

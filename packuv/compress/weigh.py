@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 
 from packuv.compress.views import Views
@@ -11,7 +13,7 @@ from packuv.progress import Ticks
 from packuv.raster import Arena, RasterOptions, render
 
 FRAMES, VIEWS = 8, 8
-"""Of a segment, at most, spread evenly; and in each of them"""
+"""Of a segment, at most, spread evenly; and in each of them, or as many as it takes to look from each camera once"""
 WORTH = 4e5
 """Of a picture, in noise a Gaussian: what stays must make up so much of one. Measured, docs/compression.md"""
 
@@ -24,22 +26,29 @@ def weigh(
     Infinite where a row is in none of the frames that were drawn: nothing is known of it.
     """
     most, known = np.zeros(len(segment.key), np.float32), np.zeros(len(segment.key), bool)
-    options, arena = RasterOptions(near=near), Arena()
-    for index in _spread(len(segment)):
+    options, arena, frames = RasterOptions(near=near), Arena(), _spread(len(segment))
+    count = _views(len(frames), len(views))
+    cameras = views.sweep(count * len(frames), rng)
+    for index in frames:
         codes = segment.frame(index)
         gaussians = quantizer.decode(codes)
         known |= codes.attributes[:, OPACITY] > 0
-        for _ in range(VIEWS):
-            camera = views.draw(rng)
+        for camera in islice(cameras, count):
             drawn = render(gaussians, camera, options=options, weights=True, arena=arena)
             most = np.maximum(most, drawn.weights / (camera.width * camera.height))
             ticks.advance()
     return np.where(known, most, np.float32(np.inf))
 
 
-def pictures_of(frames: int) -> int:
-    """How many pictures `weigh` draws of a segment with so many frames."""
-    return VIEWS * len(_spread(frames))
+def pictures_of(frames: int, cameras: int) -> int:
+    """How many pictures `weigh` draws of a segment with so many frames, and so many cameras to see them."""
+    drawn = len(_spread(frames))
+    return drawn * _views(drawn, cameras)
+
+
+def _views(frames: int, cameras: int) -> int:
+    """In each of so many frames."""
+    return max(VIEWS, -(-cameras // frames))
 
 
 def _spread(frames: int) -> list[int]:

@@ -64,7 +64,17 @@ def test_weights_are_those_of_pictures(cameras):
     assert found[ROWS - 2] < np.median(found)
     assert (found[:-1] >= 0).all()
     assert found[:-1].max() <= 1
-    assert pictures_of(len(segment)) == 8 * len(segment)
+
+
+@pytest.mark.parametrize(("frames", "cameras", "pictures"), [(1, 3, 8), (3, 3, 24), (30, 27, 64), (30, 90, 96)])
+def test_each_camera_is_looked_from(frames, cameras, pictures):
+    assert pictures_of(frames, cameras) == pictures
+
+
+def test_a_sweep_begins_at_each_camera_as_often(cameras):
+    rng, views = np.random.default_rng(7), Views(cameras)
+    names = [camera.name for camera in views.sweep(7, rng)]
+    assert sorted(names[:3]) == sorted(names[3:6]) == [camera.name for camera in cameras]
 
 
 def test_more_noise_leaves_fewer_and_never_none():
