@@ -398,9 +398,7 @@ def _sequence(options: argparse.Namespace, folder: Path) -> tuple[list[Path], Sc
 
 def _unpacked(path: Path, folder: Path) -> tuple[list[Path], SceneHeader, Any]:
     """The segments of a scene file."""
-    with open_scene(path) as scene:
-        if not scene.lossless:
-            raise ValueError(f"{path} is lossy; measure on a lossless scene file")
+    with command.lossless(path) as scene:
         segments = [scene.segment(number) for number in range(len(scene.index.segments))]
         return _saved(segments, folder), scene.header, f"scene file {path.name}"
 

@@ -7,8 +7,15 @@ from __future__ import annotations
 
 import argparse
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipelines.plugins import Add
+
+if TYPE_CHECKING:
+    from packuv.scene import Scene
 
 BENCHMARKS = (
     "ablation",
@@ -55,3 +62,14 @@ def parser(name: str, text: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(
         prog=f"packuv bench {name}", description=text, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+
+
+@contextmanager
+def lossless(path: Path) -> Iterator[Scene]:
+    """A scene file to measure on. Raises ValueError for one that is lossy, and what `open_scene` raises."""
+    from packuv.scene import open_scene
+
+    with open_scene(path) as scene:
+        if not scene.lossless:
+            raise ValueError(f"{path} is lossy; measure on a lossless scene file")
+        yield scene

@@ -29,11 +29,10 @@ from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import Steps
-from packuv.compress.views import Views
 from packuv.gaussians.codes import attribute_count
 from packuv.metrics import decibels, ssim
 from packuv.progress import Ticks, no_progress
-from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, Tolerance, open_scene, write_scene
+from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, Tolerance, write_scene
 
 KINDS = {"position": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 9), "opacity": slice(9, 10)}
 """Of the 3 + A kinds of codes; colours are the rest"""
@@ -49,8 +48,6 @@ class _Table:
         self.segments = [scene.segment(number) for number in range(len(scene.index.segments))]
         self.codes = sum(len(part.key) * len(part) for part in self.segments)
         self.sensitivity = sensitivity(scene, self._judge.learned, self._judge.frames)
-        fitted = [camera for camera in scene.header.cameras if camera.name not in scene.header.held_out]
-        self._views = Views(fitted or self._judge.learned)
 
     def row(self, name: str, tolerance: Tolerance, steps: Steps | None = None) -> dict[str, Any]:
         """Size and distortion of the scene so written."""
@@ -62,7 +59,7 @@ class _Table:
     def fewer(self, noise: float, steps: Steps) -> dict[str, Any]:
         """The same of the rows that are worth their bits, moved to make up for the others."""
         started = time.perf_counter()
-        rows = Rows(self._scene, self._views, self._folder, seed=0, ticks=Ticks(no_progress, 1))
+        rows = Rows(self._scene, self._judge.views, self._folder, seed=0, ticks=Ticks(no_progress, 1))
         paths = rows.coarse(noise, steps, ITERATIONS)
         facts = {"rows": rows.kept / rows.count, "seconds": round(time.perf_counter() - started, 1)}
         return {**self._measured(f"fewer, noise {noise:g}", paths, steps.tolerance, steps), **facts}
@@ -136,6 +133,21 @@ def table(rows: Sequence[dict[str, Any]], raw_bits: float) -> str:
     return "\n".join(lines)
 
 
+def facts_of(scene: Scene, benchmark: str, words: Sequence[str]) -> dict[str, Any]:
+    """What was measured, and by which command."""
+    entry, degree = scene.index.segments[0], scene.header.quantizer.sh_degree
+    return {
+        "source": scene.path.name,
+        "command": shlex.join(["packuv", "bench", benchmark, *words]),
+        "load": os.getloadavg()[0],
+        "frames": len(scene),
+        "gaussians": entry.rows,
+        "dynamic": entry.dynamic,
+        "sh_degree": degree,
+        "raw_bits": 48 + RAW_BITS * attribute_count(degree),
+    }
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = command.parser("compression", __doc__)
     parser.add_argument("--scene", type=Path, required=True, help="a lossless scene file")
@@ -146,27 +158,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--coarse-bits", type=int, default=6, help="of an attribute that is coarse alone")
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = parser.parse_args(words)
-    with open_scene(options.scene) as scene, tempfile.TemporaryDirectory() as folder:
-        if not scene.lossless:
-            raise ValueError(f"{options.scene} is lossy; measure on a lossless scene file")
-        raw_bits = 48 + RAW_BITS * attribute_count(scene.header.quantizer.sh_degree)
-        rows = []
+    with command.lossless(options.scene) as scene, tempfile.TemporaryDirectory() as folder:
+        facts, rows = facts_of(scene, "compression", words), list[dict[str, Any]]()
         for row in measure(scene, Path(folder), noises=options.noises, coarse_bits=options.coarse_bits):
             rows.append(row)
             print(row, file=sys.stderr, flush=True)
-        facts = {
-            "source": options.scene.name,
-            "command": shlex.join(["packuv", "bench", "compression", *words]),
-            "load": os.getloadavg()[0],
-            "frames": len(scene),
-            "gaussians": scene.index.segments[0].rows,
-            "dynamic": scene.index.segments[0].dynamic,
-            "raw_bits": raw_bits,
-            "rows": rows,
-        }
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(facts, indent=1) + "\n")
-    print(table(rows, raw_bits))
+    options.out.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")
+    print(table(rows, facts["raw_bits"]))
 
 
 if __name__ == "__main__":

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import shlex
 import sys
 import tempfile
 import time
@@ -27,9 +25,9 @@ from typing import Any
 import numpy as np
 
 from bench import command
-from bench.compression import RAW_BITS, distortion
+from bench.compression import distortion, facts_of
 from packuv.compress.judge import Judge
-from packuv.compress.networks import Rows, Transform, neighbours, train
+from packuv.compress.networks import Examples, Transform, neighbours, train
 from packuv.compress.sensitivity import row_sensitivity
 from packuv.compress.steps import MIDDLE, Steps
 from packuv.gaussians.codes import DC, OPACITY, Codes, Quantizer, attribute_count
@@ -44,6 +42,8 @@ SHRUNK = 0.1
 """Share of the kind's mean in the weight of a row, which few pictures tell"""
 POSITION = slice(0, 3)
 LEARNED = "learned steps"
+SINGLE = Steps(np.ones(3), np.ones(1))
+"""Those of the lossless scene"""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class _Bench:
         segment = self._segment
         key = _scaled(design, wide, segment.key.xyz, segment.key.attributes)
         moving = _scaled(design, wide, segment.xyz, segment.attributes)
-        rows = Rows(key, weights.astype(np.float32), self._around, moving)
+        rows = Examples(key, weights.astype(np.float32), self._around, moving)
         with one_torch_thread():
             return [
                 train(rows.columns(np.array(columns)), latents, hidden=design.hidden, iterations=self._iterations,
@@ -194,9 +194,8 @@ def _mapped(segment: Segment, change: Callable[[np.ndarray, np.ndarray], tuple[n
 def _codes(values: np.ndarray, attributes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions and attributes of values [..., 3 + A]; who is there in `attributes` stays there."""
     rounded = np.rint(values)
-    found = np.clip(rounded[..., POSITION.stop :], 0, 255)
-    found[..., OPACITY] = np.where(attributes[..., OPACITY] > 0, np.maximum(found[..., OPACITY], 1), 0)
-    return np.clip(rounded[..., POSITION], 0, 65535).astype(np.uint16), found.astype(np.uint8)
+    found = SINGLE.limited(rounded[..., POSITION.stop :], attributes[..., OPACITY] > 0)
+    return np.clip(rounded[..., POSITION], 0, 65535).astype(np.uint16), found
 
 
 def _scaled(design: Design, wide: np.ndarray, xyz: np.ndarray, attributes: np.ndarray) -> np.ndarray:
@@ -285,20 +284,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = parser.parse_args(words)
-    with open_scene(options.scene) as scene, tempfile.TemporaryDirectory() as name:
-        if not scene.lossless:
-            raise ValueError(f"{options.scene} is lossy; measure on a lossless scene file")
-        entry, degree = scene.index.segments[0], scene.header.quantizer.sh_degree
-        facts: dict[str, Any] = {
-            "source": options.scene.name,
-            "command": shlex.join(["packuv", "bench", "networks", *words]),
-            "load": os.getloadavg()[0],
-            "gaussians": entry.rows,
-            "dynamic": entry.dynamic,
-            "sh_degree": degree,
-            "raw_bits": 48 + RAW_BITS * attribute_count(degree),
-            "rows": [],
-        }
+    with command.lossless(options.scene) as scene, tempfile.TemporaryDirectory() as name:
+        facts: dict[str, Any] = {**facts_of(scene, "networks", words), "rows": []}
         options.out.parent.mkdir(parents=True, exist_ok=True)
         for row in _rows(prepared(scene, Path(name)), options):
             facts["rows"].append(row)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from packuv.colour import lit
+from packuv.compress.views import Views
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene, open_scene
 
@@ -26,6 +27,8 @@ class Judge:
         unseen = _spread(held_out, CAMERAS // 3 if fitted else CAMERAS)
         self.learned = _spread(fitted, CAMERAS - len(unseen)) or unseen
         """Cameras from which sensitivity is learned"""
+        self.views = Views(fitted or unseen)
+        """From which rows are weighed and tuned"""
         self.cameras = tuple(self.learned) + tuple(camera for camera in unseen if camera not in self.learned)
         self.frames = tuple(_spread(range(len(scene)), FRAMES))
         self._unseen = {camera.name for camera in self.cameras} - {camera.name for camera in self.learned}

@@ -31,7 +31,7 @@ RATE = 2e-3
 
 
 @dataclass(frozen=True)
-class Rows:
+class Examples:
     """What is learned from."""
 
     key: np.ndarray
@@ -43,8 +43,8 @@ class Rows:
     moving: np.ndarray
     """float32 [T - 1, D, d]: later frames of the first D rows"""
 
-    def columns(self, which: slice | np.ndarray) -> Rows:
-        return Rows(self.key[:, which], self.weights[:, which], self.around, self.moving[:, :, which])
+    def columns(self, which: slice | np.ndarray) -> Examples:
+        return Examples(self.key[:, which], self.weights[:, which], self.around, self.moving[:, :, which])
 
 
 def neighbours(count: int) -> np.ndarray:
@@ -64,7 +64,7 @@ def neighbours(count: int) -> np.ndarray:
 class Transform(nn.Module):
     """An encoder-decoder of rows [n, d] to integer latents [n, k] and back."""
 
-    def __init__(self, rows: Rows, latents: int, hidden: int) -> None:
+    def __init__(self, rows: Examples, latents: int, hidden: int) -> None:
         """Begin as the main axes: of what FFV1 predicts badly, or of the values, where latents are fewer than these."""
         super().__init__()
         d = rows.key.shape[1]
@@ -75,19 +75,19 @@ class Transform(nn.Module):
         self.into = nn.Parameter(torch.as_tensor(axes.astype(np.float32)))  # [k, d]
         self.back = nn.Parameter(self.into.detach().T.contiguous())  # [d, k]
         self.width = torch.as_tensor((rows.key @ axes.T).std(axis=0) + 1e-3).float()
-        self.encoder, self.decoder = network(d, hidden, latents), network(latents, hidden, d)
+        self.encoder, self.decoder = _network(d, hidden, latents), _network(latents, hidden, d)
         self.scales = nn.Parameter(torch.zeros(3, latents))  # logarithms of Laplace's, and how they grow with activity
 
     def encode(self, values: Tensor) -> Tensor:
         """[n, d] -> [n, k], not rounded."""
         offset = values - self.mean
         straight = offset @ self.into.T
-        return straight + self.width * passed(self.encoder, offset / self.spread) if self.hidden else straight
+        return straight + self.width * _passed(self.encoder, offset / self.spread) if self.hidden else straight
 
     def decode(self, latents: Tensor) -> Tensor:
         """[n, k] -> [n, d]."""
         straight = latents @ self.back.T + self.mean
-        return straight + self.spread * passed(self.decoder, latents / self.width) if self.hidden else straight
+        return straight + self.spread * _passed(self.decoder, latents / self.width) if self.hidden else straight
 
     def latents(self, values: np.ndarray) -> np.ndarray:
         """Of values float32 [..., d], rounded, int64 [..., k] within MOST_LATENT."""
@@ -103,7 +103,7 @@ class Transform(nn.Module):
     @property
     def bytes(self) -> int:
         """Of what a decoder needs: 8 bits a weight of the network, 32 of everything else."""
-        return network_bytes(self.decoder) + 4 * (self.back.numel() + 2 * len(self.mean) + len(self.width))
+        return _network_bytes(self.decoder) + 4 * (self.back.numel() + 2 * len(self.mean) + len(self.width))
 
 
 def _axes(values: np.ndarray) -> np.ndarray:
@@ -113,7 +113,7 @@ def _axes(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(axes)
 
 
-def network(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+def _network(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     """Two hidden layers; begins as 0, so that the matrices are all there is."""
     if not hidden:
         return nn.Sequential()
@@ -123,13 +123,13 @@ def network(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last)
 
 
-def network_bytes(found: nn.Sequential) -> int:
+def _network_bytes(found: nn.Sequential) -> int:
     """8 bits a weight, 32 a bias and the weights' step."""
     layers = [layer for layer in found if isinstance(layer, nn.Linear)]
     return sum(layer.weight.numel() + 4 * (layer.bias.numel() + 1) for layer in layers)
 
 
-def passed(found: nn.Sequential, values: Tensor) -> Tensor:
+def _passed(found: nn.Sequential, values: Tensor) -> Tensor:
     """What a network makes of values, its weights rounded to 8 bits; gradients pass as if they were not."""
     for layer in found:
         if isinstance(layer, nn.Linear):
@@ -142,7 +142,7 @@ def passed(found: nn.Sequential, values: Tensor) -> Tensor:
 
 
 def train(
-    rows: Rows, latents: int, *, hidden: int = 48, iterations: int = 150, seed: int = 0, weight: float = EXCHANGE
+    rows: Examples, latents: int, *, hidden: int = 48, iterations: int = 150, seed: int = 0, weight: float = EXCHANGE
 ) -> Transform:
     """An encoder-decoder of these rows; the same seed gives the same one. `weight` is that of a squared error, bits."""
     with torch.random.fork_rng(devices=[]):
@@ -166,7 +166,7 @@ def train(
 class _Batches:
     """Rows at random."""
 
-    def __init__(self, rows: Rows, seed: int) -> None:
+    def __init__(self, rows: Examples, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
         self._key, self._weights = torch.as_tensor(rows.key), torch.as_tensor(rows.weights)
         self._around = np.concatenate([np.arange(len(rows.key))[:, None], rows.around], axis=1)

@@ -15,7 +15,6 @@ from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import Steps
 from packuv.compress.tune import DRAWN
-from packuv.compress.views import Views
 from packuv.compress.weigh import pictures_of
 from packuv.metrics import decibels
 from packuv.progress import Progress, Ticks, no_progress
@@ -141,43 +140,43 @@ class _Work:
         learned, segments = self._judge.learned, scene.index.segments
         self._passes = [iterations] + [-(-iterations // AGAIN)] * CORRECTIONS if iterations else []
         self._pictures = len(self._judge.cameras) * len(self._judge.frames)
-        fitted = [camera for camera in scene.header.cameras if camera.name not in scene.header.held_out]
-        views = Views(fitted or learned)
         first = len(learned) * len(self._judge.frames)
-        first += sum(pictures_of(entry.frames, len(views)) for entry in segments)
-        trials = self._pictures * (TRIALS + 1 + len(self._passes))
+        first += sum(pictures_of(entry.frames, len(self._judge.views)) for entry in segments)
+        trials = self._pictures * (TRIALS + len(self._passes))
         tuned = DRAWN * len(segments) * sum(self._passes)
         self._ticks = Ticks(progress, first + trials + tuned + 1)
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, seed=seed, ticks=self._ticks)
-        self._rows = Rows(scene, views, folder, seed=seed, ticks=self._ticks)
+        self._rows = Rows(scene, self._judge.views, folder, seed=seed, ticks=self._ticks)
         self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
         self._sound = scene.sound()
 
     def search(self) -> Compressed:
         """What is nearest to the goal on its safe side, its segments kept: no larger than asked for, no worse than
         allowed. Codes as they are tell about where that is, moved ones where exactly."""
-        best = self._trial(self._bisect())
-        self._rows.keep()
-        return self._tune(best)
+        return self._tune(self._bisect())
 
-    def _bisect(self) -> float:
-        """The noise that is nearest to the goal on its safe side, codes being as they are."""
-        coarse, fine = self._trial(COARSEST), self._trial(FINEST)
-        self._check_reach(fine, coarse)
+    def _bisect(self) -> Compressed:
+        """What is nearest to the goal on its safe side, codes being as they are."""
+        unsafe, safe = (FINEST, COARSEST) if self._goal.ratio is not None else (COARSEST, FINEST)
+        ends = {noise: self._trial(noise) for noise in (unsafe, safe)}
+        self._rows.keep()
+        self._check_reach(ends[FINEST], ends[COARSEST])
+        best = ends[safe]
         low, high = math.log(FINEST), math.log(COARSEST)
-        safe = COARSEST if self._goal.ratio is not None else FINEST
         for _ in range(TRIALS - 2):
             middle = math.exp((low + high) / 2)
-            found, wanted, tolerance = self._goal.told(self._trial(middle))
+            trial = self._trial(middle)
+            found, wanted, tolerance = self._goal.told(trial)
             if found > wanted:
                 high = math.log(middle)
             else:
                 low = math.log(middle)
             if (found >= wanted) == (self._goal.ratio is not None):
-                safe = middle
+                best = trial
+                self._rows.keep()
                 if abs(found - wanted) <= tolerance * wanted:
                     break
-        return safe
+        return best
 
     def _tune(self, best: Compressed) -> Compressed:
         """The best of it and some trials with codes moved, each from where the last one left them."""

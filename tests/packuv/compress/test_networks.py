@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from packuv.compress.networks import MOST_LATENT, Rows, neighbours, train
+from packuv.compress.networks import MOST_LATENT, Examples, neighbours, train
 from packuv.gaussians.codes import Codes, Quantizer
 from packuv.scene import open_scene, write_scene
 from packuv.scene.mosaic import NEUTRAL
@@ -24,7 +24,7 @@ def synthetic(wide=1.0):
     values = np.concatenate([walk, walk + rng.normal(size=(COUNT, 2))], axis=1) * 3 / wide
     moving = values[:MOVING] + np.cumsum(rng.normal(size=(LATER, MOVING, 4)), axis=0) / wide
     weights = np.ones((COUNT, 4), np.float32)
-    return Rows(values.astype(np.float32), weights, neighbours(COUNT), moving.astype(np.float32))
+    return Examples(values.astype(np.float32), weights, neighbours(COUNT), moving.astype(np.float32))
 
 
 def bits(latents):
