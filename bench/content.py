@@ -56,9 +56,7 @@ class Filmed:
         seen, rows = self.seen[name], slice(window.start, window.stop)
         steps = {(int(own[row - 1]), int(own[row])): row for row in np.flatnonzero(seen.there)}
         wanted = [steps.get((int(new[row - 1]), int(new[row])), -1) if row else -1 for row in range(len(new))[rows]]
-        found = np.array(wanted)
-        moving = np.where(found[:, None] >= 0, seen.moving[found], np.float32(0))
-        return replace(seen, moving=moving, there=found >= 0)
+        return seen.at(np.array(wanted))
 
 
 def gather(folder: Path) -> Iterator[dict[str, Any]]:

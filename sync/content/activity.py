@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
 class Activity:
-    """Where the pictures of one camera change from instant to instant, in the cells of a coarse grid."""
+    """Where the pictures of one camera change from instant to instant, and which way, in the cells of a coarse grid."""
 
-    moving: np.ndarray
-    """float32 [T, P]: share of each cell that changed since the instant before"""
     there: np.ndarray
     """bool [T]: whether the camera has a picture at this instant and the one before"""
+    instants: np.ndarray
+    """int64 [n], ascending: when something moves"""
+    cells: np.ndarray
+    """int64 [n]: in which cell"""
+    shares: np.ndarray
+    """float32 [n]: of this cell that changed since the instant before"""
+    flow: np.ndarray
+    """float32 [n, 2]: mean motion of what changed there, cells across and down; 0 where nobody measured it"""
+    count: int
+    """Cells of a picture, P"""
     centre: np.ndarray | None = None
     """float64 [3], world axes; None where nobody knows how the cameras stand"""
     rays: np.ndarray | None = None
@@ -23,22 +30,28 @@ class Activity:
     width: int = 0
     """Cells in a row of the grid; likewise"""
 
-    @cached_property
-    def changes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Instants and cells [n] where something moves, and the shares of these cells."""
-        instants, cells = np.nonzero(self.moving)
-        return instants, cells, self.moving[instants, cells]
-
     @property
     def posed(self) -> bool:
         """Whether it is known how the camera stands."""
         return self.centre is not None and self.rays is not None
 
+    def at(self, rows: np.ndarray) -> Activity:
+        """The same at instants int64 [m] of its own; at -1 there is no picture."""
+        starts, stops = (np.searchsorted(self.instants, rows, side) for side in ("left", "right"))
+        lengths = stops - starts  # none at -1
+        kept = np.repeat(starts - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
+        there = np.where(rows >= 0, self.there[rows], False)
+        instants = np.repeat(np.arange(len(rows)), lengths)
+        return replace(
+            self,
+            there=there,
+            instants=instants,
+            cells=self.cells[kept],
+            shares=self.shares[kept],
+            flow=self.flow[kept],
+        )
+
     def later(self, by: int) -> Activity:
         """The same at instants that are so many later; what comes in is not there."""
-        if not by:
-            return self
-        moving, there = np.roll(self.moving, by, axis=0), np.roll(self.there, by)
-        outside = slice(by) if by > 0 else slice(by, None)
-        moving[outside], there[outside] = 0, False
-        return replace(self, moving=moving, there=there)
+        rows = np.arange(len(self.there)) - by
+        return self.at(np.where((rows >= 0) & (rows < len(rows)), rows, -1)) if by else self

@@ -6,7 +6,7 @@ import numpy as np
 
 BLOCKS = 8
 """Of instants that are left out in turn, which tells how sure an offset is"""
-WHILE = 21
+WHILE = 13
 """Instants over which a mean is taken that slow changes of how much moves do not enter"""
 LEAST_OVERLAP = 0.5
 """Share of its instants that two signals must have in common at an offset that is tried"""

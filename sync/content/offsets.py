@@ -10,7 +10,6 @@ import numpy as np
 from sync.content.activity import Activity
 from sync.content.agreement import BLOCKS, LEAST_OVERLAP
 from sync.content.barcodes import Agreements, compare_pairs
-from sync.content.hull import compare_with_hull
 
 APART = 2 / 3
 """Offset in instants from which a camera is said to be off: a whole frame, less what is measured too little"""
@@ -150,7 +149,7 @@ def find_offsets(
         return {}
     places = np.zeros(len(names), np.int64)
     if not paired:
-        pairs = compare_pairs(cameras, reach)
+        *_, pairs = compare_pairs(cameras, reach)
         if not pairs:
             return {}
         places = _settle(pairs, _grown(pairs, len(names), reach), reach)
@@ -242,10 +241,10 @@ def _strain(found: Mapping[int, Offset]) -> float:
 def _measure(cameras: Sequence[Activity], places: np.ndarray, reach: int) -> dict[int, Offset]:
     """Offsets that are left once each camera is moved to its place; those that no motion tells are missing."""
     moved = [one.later(int(place)) for one, place in zip(cameras, places, strict=True)]
-    pairs, still = compare_pairs(moved, reach), np.zeros(len(cameras), np.int64)
+    agreements, still = compare_pairs(moved, reach), np.zeros(len(cameras), np.int64)
     found = {}
-    for camera, hull in enumerate(compare_with_hull(moved, reach)):
-        kinds = [against_others(pairs, camera, still, reach), hull[None][: int(hull.any())]]
+    for camera in range(len(cameras)):
+        kinds = [against_others(pairs, camera, still, reach) for pairs in agreements]
         told = [(parts.sum(axis=0), _locate(parts, reach)) for parts in kinds if len(parts)]
         if told:
             found[camera] = _combined(told, reach)
@@ -319,7 +318,7 @@ def _locate(own: np.ndarray, reach: int) -> Offset:
 
 
 def _combined(told: Sequence[tuple[np.ndarray, Offset]], reach: int) -> Offset:
-    """Mean of what barcodes and hull tell, levels [2 reach + 1, BLOCKS] and offset each, by their errors; less sure the
+    """Mean of what kinds of signals tell, levels [2 reach + 1, BLOCKS] and offset each, by their errors; less sure the
     more they disagree."""
     weights = np.array([own.error**-2 for _, own in told])
     offsets = np.array([own.instants for _, own in told])

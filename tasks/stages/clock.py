@@ -39,7 +39,7 @@ WINDOW_SECONDS = 20.0
 class FindStarts(Stage):
     """Find when each camera began to film, by what moves or sounds: starts.json, in seconds by camera."""
 
-    name, version = "clock", 5
+    name, version = "clock", 6
     videos: Files
     timecodes: Files
     calibration: Files | None
@@ -83,7 +83,7 @@ class FindStarts(Stage):
     def _answers(
         self, capture: Capture, infos: Mapping[str, VideoInfo], frames: np.ndarray, period_s: float, work: Work
     ) -> Iterator[tuple[str, Starts]]:
-        """What tells it, best first: lines and hulls of a calibrated rig, sound, then how much moves in pictures."""
+        """What tells it, best first: lines of a calibrated rig, sound, then how much moves in pictures."""
         sizes = {name: (info.width, info.height) for name, info in infos.items()}
         posed = _calibrated(capture, sizes) if self.calibration is not None else None
         if posed:
@@ -99,7 +99,7 @@ class FindStarts(Stage):
     ) -> Mapping[str, Activity]:
         views = Views(dict(capture.videos), frames, lenses, transfer=self.transfer)
         folder = work.scratch / ("posed" if posed else "filmed")
-        options, threads = self.options, work.site.threads
+        options, threads = replace(self.options, keep_flow=posed), work.site.threads
         cache = measure_motion(views, folder, options, workers=threads, progress=work.progress)
         whole = range(len(frames))
         return {
@@ -120,7 +120,7 @@ def find_starts(workshop: Workshop, options: MotionOptions, transfer: Transfer |
         fps=capture.settings.fps,
         timecode_column=capture.settings.timecode_column,
         transfer=transfer,
-        options=replace(options, keep_flow=False, backend=MotionBackend.DIS),  # only masks are wanted
+        options=replace(options, keep_flow=False, backend=MotionBackend.DIS),
     )
 
 

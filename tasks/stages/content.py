@@ -24,6 +24,8 @@ from tasks.stages.track import MOTION
 OFFSETS = "offsets.json"
 GRID_WIDTH = 160
 """Cells across a picture in which motion is counted"""
+LEAST_SHARE = 1e-3
+"""Of a cell: the motion of less is taken to be smaller, not divided by nothing"""
 LONGEST_STEP = 2
 """Instants between two pictures of a camera that films fewer than most: a third of them tells wrong times"""
 
@@ -32,7 +34,7 @@ LONGEST_STEP = 2
 class CompareContent(Stage):
     """Measure by what moves how far each camera's pictures lie from the others' at the same instants: offsets.json."""
 
-    name, version = "content", 6
+    name, version = "content", 7
     take: Take
     """Of the cameras whose motion is measured"""
     unseen: tuple[str, ...]
@@ -42,29 +44,34 @@ class CompareContent(Stage):
     options: ContentOptions
 
     def build(self, work: Work) -> Notes:
-        cache = MotionCache.load(work.path(self.motion) / MOTION)
         groups = Footage(self.take, work.site).load_groups()
+        cache = MotionCache.load(work.path(self.motion) / MOTION)
         windows = choose_windows(np.nan_to_num(cache.steps["share"]).mean(axis=1), self.options)
         found = []
         for number, window in enumerate(windows):
             work.progress(number, len(windows))
-            seen = {**self._fitted(work, cache, window), **self._others(work, window)}
-            offsets = find_offsets(seen, self.options.reach, expected_offsets(groups, window))
+            offsets = find_offsets(
+                self._seen(work, cache, window), self.options.reach, expected_offsets(groups, window)
+            )
             found.append({"instants": [window.start, window.stop], "offsets": offsets})
         save_json(work.out / OFFSETS, {"cameras": [*self.take.cameras, *self.unseen], "windows": _plain(found)})
         return {"windows": len(windows), "lie": sorted({name for name, _ in _lies(found)})}
 
-    def _fitted(self, work: Work, cache: MotionCache, window: range) -> Mapping[str, Activity]:
-        cameras = Footage(self.take, work.site).open_views().cameras
-        return {camera.name: activity_of(cache, column, camera, window) for column, camera in enumerate(cameras)}
+    def _seen(self, work: Work, cache: MotionCache, window: range) -> Mapping[str, Activity]:
+        """Of the measured cameras, and of those that the measurement lacks or of which it kept no flow."""
+        kept = self.take.cameras if cache.options.keep_flow else ()
+        cameras = Footage(self.take, work.site).open_views().cameras if kept else ()
+        known = {camera.name: activity_of(cache, column, camera, window) for column, camera in enumerate(cameras)}
+        others = tuple(name for name in (*self.take.cameras, *self.unseen) if name not in kept)
+        return {**known, **self._measured(work, others, window)}
 
-    def _others(self, work: Work, window: range) -> Mapping[str, Activity]:
-        if not self.unseen:
+    def _measured(self, work: Work, cameras: tuple[str, ...], window: range) -> Mapping[str, Activity]:
+        if not cameras:
             return {}
         first = self.take.first + window.start
-        take = replace(self.take, cameras=self.unseen, light=None, first=first, stop=first + len(window))
+        take = replace(self.take, cameras=cameras, light=None, first=first, stop=first + len(window))
         views = Footage(take, work.site).open_views()
-        options = replace(self.motion_options, keep_flow=False, backend=MotionBackend.DIS)  # only masks are wanted
+        options = replace(self.motion_options, keep_flow=True, backend=MotionBackend.DIS)
         cache = measure_motion(views, work.scratch / f"motion-{window.start}", options, workers=work.site.threads)
         whole = range(len(window))
         return {camera.name: activity_of(cache, column, camera, whole) for column, camera in enumerate(views.cameras)}
@@ -96,26 +103,49 @@ def choose_windows(moving: np.ndarray, options: ContentOptions) -> list[range]:
 def activity_of(
     cache: MotionCache, column: int, camera: PinholeCamera, window: range, *, posed: bool = True
 ) -> Activity:
-    """Motion of one camera in the cells of a grid, and where the cells are if its pose is known.
+    """Motion of one camera in the cells of a grid; if its pose is known, also which way, and where the cells are.
 
     What changed in a longer step, of a camera that films every second instant, counts for both.
     """
     height = max(1, round(GRID_WIDTH * camera.height / camera.width))
-    moving = np.zeros((len(window), height, GRID_WIDTH), np.float32)
     previous = np.array([cache.previous[instant, column] for instant in window])
     steps = np.where(previous >= window.start, np.array(window) - previous, LONGEST_STEP + 1)
     usual = int(steps.min(initial=LONGEST_STEP + 1))
-    there = np.zeros(len(window), bool)
+    there, found = np.zeros(len(window), bool), [_nothing()]
     for row in np.flatnonzero((steps == usual) & (usual <= LONGEST_STEP)):
-        measured = cache.measured(column, window[row])
-        assert measured is not None, "there is a step to this instant"
-        within = slice(row - usual + 1, row + 1)
-        moving[within] = cv2.resize(measured.astype(np.float32), (GRID_WIDTH, height), interpolation=cv2.INTER_AREA)
-        there[within] = True
-    own = Activity(moving.reshape(len(window), -1), there)
+        shares, flow = _changed(cache, column, window[row], (GRID_WIDTH, height), flow=posed)
+        cells = np.flatnonzero(shares)
+        for instant in range(row - usual + 1, row + 1):
+            there[instant] = True
+            found.append((np.full(len(cells), instant), cells, shares[cells], flow[cells] / usual))
+    instants, cells, shares, flow = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    own = Activity(there, instants, cells, shares, flow * np.float32(GRID_WIDTH / camera.width), GRID_WIDTH * height)
     return (
         replace(own, centre=camera.centre, rays=_rays(camera, GRID_WIDTH, height), width=GRID_WIDTH) if posed else own
     )
+
+
+def _nothing() -> tuple[np.ndarray, ...]:
+    """Instants, cells, shares and flow of no cell."""
+    return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32), np.empty((0, 2), np.float32)
+
+
+def _changed(
+    cache: MotionCache, column: int, instant: int, size: tuple[int, int], *, flow: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share of each cell of a grid that changed, float32 [P], and its mean motion, pixels of the picture [P, 2]; 0
+    where nothing changed, and if it is not asked for."""
+    measured = cache.measured(column, instant)
+    assert measured is not None, "there is a step to this instant"
+    mask = measured.astype(np.float32)
+    shares = cv2.resize(mask, size, interpolation=cv2.INTER_AREA).reshape(-1)
+    if not flow:
+        return shares, np.zeros((len(shares), 2), np.float32)
+    vectors = cache.optical_flow(column, instant)
+    assert vectors is not None, "there is a step to this instant"
+    weights = cv2.resize(mask, vectors.shape[1::-1], interpolation=cv2.INTER_AREA)[..., None]
+    both = cv2.resize(np.dstack([vectors * weights, weights]), size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    return shares, both[:, :2] / np.maximum(both[:, 2:], LEAST_SHARE)
 
 
 def _rays(camera: PinholeCamera, width: int, height: int) -> np.ndarray:

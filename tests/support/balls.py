@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 WIDTH, HEIGHT = 96, 54
@@ -28,15 +30,21 @@ def pixels_of(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
 
 def covered(number: int, count: int, times: np.ndarray, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """Where a camera sees a ball at each time, in instants: bool [T, height * width]."""
+    return np.any([disc for disc, _ in discs(number, count, times, width, height)], axis=0)
+
+
+def discs(
+    number: int, count: int, times: np.ndarray, width: int = WIDTH, height: int = HEIGHT
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For each ball where a camera sees it, bool [T, height * width], and its middle in pixels, float64 [T, 2]."""
     turn, centre = camera_pose(number, count)
     pixels = pixels_of(width, height)
-    seen = np.zeros((len(times), width * height), bool)
+    focal = pixels[2, 0]
     for way in _ways(times):
         x, y, z = turn @ (way - centre).T
-        focal = pixels[2, 0]
-        away = np.hypot(pixels[0] - (focal * x / z)[:, None], pixels[1] - (focal * y / z)[:, None])
-        seen |= away < (focal * RADIUS / z)[:, None]
-    return seen
+        middle = focal * np.stack([x, y], axis=1) / z[:, None]
+        away = np.hypot(*(pixels[axis] - middle[:, axis, None] for axis in (0, 1)))
+        yield away < (focal * RADIUS / z)[:, None], middle
 
 
 def _ways(times: np.ndarray) -> np.ndarray:

@@ -8,21 +8,40 @@ import pytest
 from sync.content import Activity, Content, Offset, Window, find_offsets
 from sync.content.agreement import BLOCKS
 from sync.content.offsets import _combined
-from tests.support.balls import WIDTH, camera_pose, covered, pixels_of
+from tests.support.balls import WIDTH, camera_pose, discs, pixels_of
 
 INSTANTS, REACH = 120, 8
 
 
 def seen_by(number: int, count: int, times: np.ndarray, *, lost: tuple[int, ...] = ()) -> Activity:
     """What moves in the pictures of a camera that films at these times, in instants: where balls were and are."""
-    seen = covered(number, count, times)
-    moving = np.zeros(seen.shape, np.float32)
-    moving[1:] = seen[1:] | seen[:-1]
+    moving = np.zeros((len(times), len(pixels_of()[0])), np.float32)
+    flow = np.zeros((*moving.shape, 2), np.float32)
+    for disc, middle in discs(number, count, times):
+        swept = disc[1:] | disc[:-1]
+        moving[1:][swept] = 1
+        flow[1:][swept] = np.repeat(np.diff(middle, axis=0), swept.sum(axis=1), axis=0)
     there = np.arange(len(times)) > 0
     there[list(lost)] = False
     moving[list(lost)] = 0
     turn, centre = camera_pose(number, count)
-    return Activity(moving, there, centre, (turn.T @ pixels_of()).T, WIDTH)
+    return _activity(moving, flow, there, centre, (turn.T @ pixels_of()).T)
+
+
+def _activity(
+    moving: np.ndarray, flow: np.ndarray, there: np.ndarray, centre: np.ndarray, rays: np.ndarray
+) -> Activity:
+    instants, cells = np.nonzero(moving)
+    shares = moving[instants, cells]
+    return Activity(there, instants, cells, shares, flow[instants, cells], moving.shape[1], centre, rays, WIDTH)
+
+
+def _moving_at(own: Activity, moving: np.ndarray) -> Activity:
+    """A camera as it stands, if this moved in its pictures, float32 [T, P], each cell by chance."""
+    flow = np.random.default_rng(1).normal(size=(*moving.shape, 2)).astype(np.float32)
+    assert own.centre is not None
+    assert own.rays is not None
+    return _activity(moving, flow, np.arange(len(moving)) > 0, own.centre, own.rays)
 
 
 def rig(count: int, late: dict[int, float] | None = None) -> dict[str, Activity]:
@@ -59,7 +78,7 @@ def test_a_liar_among_few_draws_nobody_along(late):
 
 
 def _first(own: Activity, instants: int) -> Activity:
-    return Activity(own.moving[:instants], own.there[:instants], *_place(own))
+    return own.at(np.arange(instants))
 
 
 def test_several_cameras_may_be_off_by_frames_of_their_own():
@@ -93,9 +112,10 @@ def test_lost_frames_are_no_motion_and_no_rest():
 
 def test_who_sees_nothing_move_is_not_judged():
     seen = rig(4)
-    seen["cam3"] = Activity(np.zeros_like(seen["cam3"].moving), seen["cam3"].there, *_place(seen["cam3"]))
+    nothing = np.zeros((INSTANTS, seen["cam3"].count), np.float32)
+    seen["cam3"] = _moving_at(seen["cam3"], nothing)
     assert set(find_offsets(seen, REACH)) == {"cam0", "cam1", "cam2"}
-    still = {name: Activity(np.zeros_like(own.moving), own.there, *_place(own)) for name, own in seen.items()}
+    still = {name: _moving_at(own, nothing) for name, own in seen.items()}
     assert find_offsets(still, REACH) == {}
     assert find_offsets({}, REACH) == {}
 
@@ -103,8 +123,8 @@ def test_who_sees_nothing_move_is_not_judged():
 def test_motion_that_no_other_camera_sees_decides_nothing():
     rng = np.random.default_rng(0)
     seen = rig(5)
-    noise = (rng.random(seen["cam0"].moving.shape) < 0.002).astype(np.float32)
-    seen["cam0"] = Activity(noise, seen["cam0"].there, *_place(seen["cam0"]))
+    noise = (rng.random((INSTANTS, seen["cam0"].count)) < 0.002).astype(np.float32)
+    seen["cam0"] = _moving_at(seen["cam0"], noise)
     offsets = find_offsets(seen, REACH)
     assert not any(offset.lies for offset in offsets.values())
     assert not offsets["cam0"].decided
@@ -116,8 +136,8 @@ def test_whatever_moves_figures_are_finite(share):
     for instants in (4, 9, 17):
         seen = {}
         for name, own in rig(3).items():
-            moving = (rng.random((instants, own.moving.shape[1])) < share).astype(np.float32)
-            seen[name] = Activity(moving, np.arange(instants) > 0, *_place(own))
+            moving = (rng.random((instants, own.count)) < share).astype(np.float32)
+            seen[name] = _moving_at(own, moving)
         for offset in find_offsets(seen, REACH).values():
             assert np.isfinite([offset.instants, offset.error, offset.clear]).all()
 
@@ -139,10 +159,6 @@ def test_a_whole_frame_that_is_not_sure_is_no_confirmation():
     assert Offset(0.1, 0.3).decided
     assert not Offset(0.8, 0.28).lies
     assert not Offset(0.8, 0.28).decided
-
-
-def _place(own: Activity) -> tuple[np.ndarray | None, np.ndarray | None, int]:
-    return own.centre, own.rays, own.width
 
 
 def test_the_stretch_that_says_most_against_a_camera_is_told():
