@@ -61,8 +61,8 @@ def _pairs(seen: Sequence[Activity]) -> Iterator[tuple[int, int]]:
 
 
 def _on_lines(first: Activity, second: Activity) -> list[Signals]:
-    """Whether anything moves on common lines, 0 or 1, and how fast it turns about the axis through both cameras,
-    radians an instant; nothing where they share too few lines."""
+    """Whether anything moves on common lines, 0 or 1, and the roots of the rates at which it turns about the axis
+    through both cameras; nothing where they share too few lines."""
     assert first.centre is not None
     assert second.centre is not None
     assert first.rays is not None
@@ -91,8 +91,8 @@ def _course(seen: Activity) -> np.ndarray:
 
 
 def _told_by(seen: Activity, line: np.ndarray, count: int, planes: np.ndarray) -> Signals:
-    """Whether anything moves on each line, and the mean rate of it; cells near the axis, which turn by much for a small
-    error, count little."""
+    """Whether anything moves on each line, and the root, with its sign, of the mean rate of it, so that one throw does
+    not drown all else. Cells near the axis, which turn by much for a small error, count little."""
     assert seen.rays is not None
     lines = line[seen.cells]
     known = lines >= 0
@@ -104,5 +104,6 @@ def _told_by(seen: Activity, line: np.ndarray, count: int, planes: np.ndarray) -
         np.bincount(places, weights, minlength=len(seen.there) * count).reshape(-1, count)
         for weights in (shares, shares * turned, shares * np.square(rays).sum(axis=1))
     )
-    rates = turning / np.where(inertia > 0, inertia, 1) * np.minimum(1, moved / MOVING_CELLS)
-    return (moved > MOVING_CELLS).astype(np.float64), rates
+    rates = turning / np.where(inertia > 0, inertia, 1)
+    known_by = np.minimum(1, moved / MOVING_CELLS)
+    return (moved > MOVING_CELLS).astype(np.float64), np.sign(rates) * np.sqrt(np.abs(rates)) * known_by
