@@ -47,7 +47,7 @@ class _Table:
         self._scene, self._folder, self._judge = scene, folder, Judge(scene)
         self.segments = [scene.segment(number) for number in range(len(scene.index.segments))]
         self.codes = sum(len(part.key) * len(part) for part in self.segments)
-        self.sensitivity = sensitivity(scene, self._judge.learned, self._judge.frames)
+        self.sensitivity = sensitivity(scene, self._judge.learned, self._judge.frames, near=self._judge.near)
 
     def row(self, name: str, tolerance: Tolerance, steps: Steps | None = None) -> dict[str, Any]:
         """Size and distortion of the scene so written."""
@@ -59,7 +59,8 @@ class _Table:
     def fewer(self, noise: float, steps: Steps) -> dict[str, Any]:
         """The same of the rows that are worth their bits, moved to make up for the others."""
         started = time.perf_counter()
-        rows = Rows(self._scene, self._judge.views, self._folder, seed=0, ticks=Ticks(no_progress, 1))
+        judge, ticks = self._judge, Ticks(no_progress, 1)
+        rows = Rows(self._scene, judge.views, self._folder, near=judge.near, seed=0, ticks=ticks)
         paths = rows.coarse(noise, steps, ITERATIONS)
         facts = {"rows": rows.kept / rows.count, "seconds": round(time.perf_counter() - started, 1)}
         return {**self._measured(f"fewer, noise {noise:g}", paths, steps.tolerance, steps), **facts}
