@@ -12,9 +12,11 @@ from packuv.scene.header import ADOPTED
 
 IMAGINED = "imagined"
 """Name of such cameras, and of what a header says of them"""
-RINGS = (-30.0, 0.0, 30.0, 60.0)
+CLOSE, WHOLE = OrbitOptions(), OrbitOptions(size=(480, 480), share=0.995)
+"""The scene's middle large in the picture, and all of it but strays from further away"""
+RINGS = ((-30.0, CLOSE), (0.0, CLOSE), (30.0, CLOSE), (60.0, CLOSE), (-15.0, WHOLE), (45.0, WHOLE))
 """How far above the scene's middle cameras stand, degrees"""
-HELD_OUT = 15.0
+HELD_OUT = (15.0, CLOSE)
 """The ring from which nothing is learned: in the middle between two others, its cameras between theirs"""
 UNTOLD_UP = (0.0, 0.0, 1.0)
 """World, where a scene says nothing of it: the axis of the UV map, and what the viewer takes for it"""
@@ -28,22 +30,22 @@ def looked_at(scene: Scene) -> SceneHeader:
     header = scene.header
     if header.filmed:
         return header
-    frames = (drawn(scene.gaussians(frame)) for frame in range(len(scene)))
-    spheres = [middle(gaussians, share=OrbitOptions.share) for gaussians in frames if len(gaussians)]
+    shown = (drawn(scene.gaussians(frame)) for frame in range(len(scene)))
+    spheres = [[middle(g, share=look.share) for look in (CLOSE, WHOLE)] for g in shown if len(g)]
     if not spheres:
         raise ValueError(f"{scene.path} must show something to be compressed, but has no Gaussian that is drawn")
-    centre, radius = around(spheres)
+    reach = dict(zip((CLOSE, WHOLE), map(around, zip(*spheres, strict=True)), strict=True))
     up = header.up or (UP if ADOPTED in header.extra else UNTOLD_UP)
     cameras: list[PinholeCamera] = []
-    for elevation in (*RINGS, HELD_OUT):
-        azimuth = 0 if elevation == HELD_OUT else 180 / OrbitOptions.cameras
-        ring = OrbitOptions(elevation_deg=elevation, azimuth_deg=azimuth, up=up)
-        cameras += orbit(centre, radius, options=ring, name=IMAGINED, first=len(cameras))
-    others = cameras[-OrbitOptions.cameras :]
-    said = {"centre": centre.tolist(), "radius": radius, "up": list(up)}
+    for elevation, look in (*RINGS, HELD_OUT):
+        azimuth = 0 if (elevation, look) == HELD_OUT else 180 / look.cameras
+        ring = replace(look, elevation_deg=elevation, azimuth_deg=azimuth, up=up)
+        cameras += orbit(*reach[look], options=ring, name=IMAGINED, first=len(cameras))
+    others = tuple(cameras[-CLOSE.cameras :])
+    told = {"up": list(up), "spheres": [[centre.tolist(), radius] for centre, radius in reach.values()]}
     return replace(
         header,
         cameras=tuple(cameras),
         held_out=tuple(camera.name for camera in others),
-        extra={"near": near_of(tuple(others)), **header.extra, IMAGINED: said},
+        extra={"near": near_of(others), **header.extra, IMAGINED: told},
     )

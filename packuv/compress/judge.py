@@ -28,7 +28,7 @@ class Judge:
         unseen = _spread(held_out, CAMERAS // 3 if fitted else CAMERAS)
         self.learned = _spread(fitted, CAMERAS - len(unseen)) or unseen
         """Cameras from which sensitivity is learned"""
-        self.views = Views(fitted or unseen)
+        self.views = Views(fitted or unseen, filmed=header is scene.header)
         """From which rows are weighed and tuned"""
         self.cameras = tuple(self.learned) + tuple(camera for camera in unseen if camera not in self.learned)
         self.frames = tuple(_spread(range(len(scene)), FRAMES))

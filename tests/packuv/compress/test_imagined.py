@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 
 from packuv.compress import Goal, compress
-from packuv.compress.imagined import RINGS, looked_at
+from packuv.compress.imagined import CLOSE, RINGS, WHOLE, looked_at
 from packuv.compress.judge import Judge
+from packuv.compress.views import Views
+from packuv.compress.weigh import weigh
 from packuv.gaussians.codes import OPACITY, Codes, attribute_count
 from packuv.gaussians.floats import drawn
-from packuv.gaussians.orbit import OrbitOptions, middle
+from packuv.gaussians.orbit import middle
 from packuv.gaussians.segment import Segment
 from packuv.metrics import decibels
+from packuv.progress import Ticks, no_progress
 from packuv.scene import SceneHeader, open_scene, verify_scene, write_scene
 from packuv.scene.header import ADOPTED
 from tests.support.small_scene import small_quantizer, small_scene, small_segments
@@ -51,10 +54,12 @@ def test_own_cameras_are_kept(tmp_path):
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)], ids=str)
 def test_imagined_cameras_stand_in_rings_about_what_is_drawn(tmp_path, up):
     with open_scene(still_scene(tmp_path / "scene.mkv", extra={"up": up, "near": 0.25})) as scene:
-        header, (centre, radius) = looked_at(scene), middle(drawn(scene.gaussians(0)), share=OrbitOptions.share)
-        judge = Judge(scene)
+        header, judge, shown = looked_at(scene), Judge(scene), drawn(scene.gaussians(0))
+    centre, radius = middle(shown, share=CLOSE.share)
+    near_middle = np.linalg.norm(shown.means - centre, axis=1) <= middle(shown, share=WHOLE.share)[1]
+    assert near_middle.mean() > 0.9
     assert header.near == 0.25
-    assert len(header.cameras) == OrbitOptions.cameras * (len(RINGS) + 1) == len({c.name for c in header.cameras})
+    assert len(header.cameras) == CLOSE.cameras * (len(RINGS) + 1) == len({c.name for c in header.cameras})
     heights = []
     for camera in header.cameras:
         away = camera.centre - centre
@@ -62,8 +67,11 @@ def test_imagined_cameras_stand_in_rings_about_what_is_drawn(tmp_path, up):
         assert camera.camera_from_world[1, :3] @ up < 0  # down in the picture is down
         assert np.allclose(camera.forward, -away / np.linalg.norm(away))
         assert np.linalg.norm(away) > 2 * radius
+        pixels, _ = camera.project(shown.means[near_middle])
+        if camera.width == camera.height:  # what shows the whole
+            assert ((pixels > 0) & (pixels < camera.width)).all()
         heights.append(np.degrees(np.arcsin(away @ up / np.linalg.norm(away))))
-    assert np.allclose(np.unique(np.round(heights, 6)), sorted([*RINGS, 15]))
+    assert np.allclose(np.unique(np.round(heights, 6)), sorted({15.0, *(elevation for elevation, _ in RINGS)}))
     unseen = {camera.name for camera in judge.cameras} - {camera.name for camera in judge.learned}
     assert unseen
     assert unseen < set(header.held_out)
@@ -74,7 +82,7 @@ def test_up_is_that_of_splat_files_or_of_the_map_where_nothing_is_said(tmp_path)
     for extra, up in (({ADOPTED: {}}, [0, -1, 0]), ({}, [0, 0, 1])):
         with open_scene(still_scene(tmp_path / "scene.mkv", extra=extra)) as scene:
             header = looked_at(scene)
-        assert header.extra["imagined"]["up"] == up
+            assert header.extra["imagined"]["up"] == up
         assert header.near > 0
 
 
@@ -120,3 +128,20 @@ def test_a_scene_whose_cameras_see_nothing_is_refused(tmp_path):
     with pytest.raises(ValueError, match="must show something to be compressed, but its cameras see nothing"):
         compress(scene, tmp_path / "small.mkv", GOAL)
     assert not (tmp_path / "small.mkv").exists()
+
+
+def test_what_lies_beside_all_imagined_pictures_stays(tmp_path):
+    with open_scene(still_scene(tmp_path / "scene.mkv", 200)) as scene:
+        segment, header, judge = scene.segment(0), scene.header, Judge(scene)
+    key = Codes(segment.key.xyz.copy(), segment.key.attributes.copy())
+    key.xyz[0] = 32768, 32768, 65535  # straight above all cameras, which look down on the others
+    means = header.quantizer.decode(key).means[:1]
+    rng, told = np.random.default_rng(0), {"near": judge.near, "ticks": Ticks(no_progress, 1)}
+    found = [
+        weigh(replace(segment, key=key), header.quantizer, views, rng=rng, **told)
+        for views in (judge.views, Views(judge.learned))
+    ]
+    assert all(camera.centre[2] < means[0, 2] for camera in judge.learned)
+    assert np.isinf(found[0][0])
+    assert found[1][0] == 0
+    assert np.isfinite(found[0][1:]).all()
