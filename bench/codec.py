@@ -25,7 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -37,6 +37,7 @@ import numpy as np
 from bench import command
 from bench.doors import MEASURED, USUAL, Pictures, measure_doors
 from bench.entropy import channel_bits
+from bench.front_end import COLOURS
 from bench.made_up import CAMERA, NEAR, SequenceOptions, find_gaussians, make_sequence
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer
 from packuv.gaussians.segment import Segment
@@ -481,8 +482,10 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def _loss(row: dict[str, Any]) -> str:
     if row["exact"]:
         return "exact"
-    decibel = row.get("psnr_to_lossless_db")
-    return "NOT EXACT" if decibel is None else f"{decibel:.2f}"
+    if "psnr_to_lossless_db" not in row:
+        return "NOT EXACT"
+    decibel = row["psnr_to_lossless_db"]
+    return "equal" if decibel is None else f"{decibel:.2f}"
 
 
 def points(rows: Sequence[dict[str, Any]]) -> list[Point]:
@@ -495,20 +498,39 @@ Point = tuple[float, float | None, str]
 """Size in MB, PSNR in dB or None where it is lossless, and name"""
 
 
-def plot(marked: Sequence[Point], what: str) -> str:
-    """Rate against distortion as SVG: size on a logarithmic scale, lossless layouts along the top."""
-    known = [decibel for _, decibel, _ in marked if decibel]
-    low, high = np.log10([min(p[0] for p in marked) * 0.8, max(p[0] for p in marked) * 1.3])
+def plot(marked: Sequence[Point], what: str, lines: Mapping[str, Sequence[Point]] | None = None) -> str:
+    """Rate against distortion as SVG: size on a logarithmic scale, lossless layouts along the top; points with their
+    names, and lines of points, whose names stand in the corner."""
+    lines = lines or {}
+    everything = [*marked, *(point for line in lines.values() for point in line)]
+    known = [decibel for _, decibel, _ in everything if decibel]
+    low, high = np.log10([min(p[0] for p in everything) * 0.8, max(p[0] for p in everything) * 1.3])
     bottom, top = min(known, default=40) - 2, max(known, default=40) + 6
     marks = [_axes(low, high, bottom, top, what)]
-    for number, (size, decibel, label) in enumerate(sorted(marked, key=lambda point: (point[1] is None, point[0]))):
-        x = 70 + (np.log10(size) - low) / (high - low) * 820
+
+    def place(size: float, decibel: float | None) -> tuple[float, float]:
         y = 40 if decibel is None else 60 + (top - decibel) / (top - bottom) * 380
-        place = y + 4 if decibel else y + 18 + 16 * (number % 6)
-        marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4"/><text x="{x + 7:.1f}" y="{place:.1f}">{label}</text>')
+        return 70 + (np.log10(size) - low) / (high - low) * 820, y
+
+    for number, (name, line) in enumerate(lines.items()):
+        colour = COLOURS[number % len(COLOURS)]
+        path = "L".join(f"{x:.1f} {y:.1f}" for x, y in (place(size, decibel) for size, decibel, _ in line))
+        marks.append(f'<path d="M{path}" fill="none" stroke="{colour}"/>')
+        marks.append(f'<text x="90" y="{64 + 18 * number}" fill="{colour}" font-weight="bold">{name}</text>')
+        marks += [_dot(*place(size, decibel), label, colour) for size, decibel, label in line]
+    below = 0
+    for size, decibel, label in sorted(marked, key=lambda point: (point[1] is None, point[0])):
+        x, y = place(size, decibel)
+        under = y + 4 if decibel else y + 18 + 16 * (below % 6)
+        below += decibel is None
+        marks.append(_dot(x, y, label, "black") + f'<text x="{x + 7:.1f}" y="{under:.1f}">{label}</text>')
     body = "".join(marks)
     head = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1060 500" font-family="sans-serif" font-size="12">'
     return f"{head}{body}</svg>\n"
+
+
+def _dot(x: float, y: float, label: str, colour: str) -> str:
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"><title>{label}</title></circle>'
 
 
 def _axes(low: float, high: float, bottom: float, top: float, what: str) -> str:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from bench import command
-from bench.codec import plot
+from bench.codec import Point, plot
 from packuv.compress import ITERATIONS
 from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
@@ -181,6 +181,16 @@ def table(rows: Sequence[dict[str, Any]], raw_bits: float) -> str:
     return "\n".join(lines)
 
 
+def drawn(rows: Sequence[dict[str, Any]]) -> str:
+    """The plot: a line through what differs in its noise alone."""
+    alone, lines = list[Point](), dict[str, list[Point]]()
+    for row in rows:
+        way, by_noise, _ = row["name"].partition(", noise ")
+        point = row["bytes"] / 1e6, row["psnr_db"], row["name"]
+        (lines.setdefault(way, []) if by_noise else alone).append(point)
+    return plot(alone, "MB", lines)
+
+
 def facts_of(scene: Scene, benchmark: str, words: Sequence[str]) -> dict[str, Any]:
     """What was measured, and by which command."""
     entry, degree = scene.index.segments[0], scene.header.quantizer.sh_degree
@@ -215,8 +225,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")
     if options.plot:
-        marked = [(row["bytes"] / 1e6, row["psnr_db"], row["name"]) for row in rows]
-        options.plot.write_text(plot(marked, "MB"))
+        options.plot.write_text(drawn(rows))
     print(table(rows, facts["raw_bits"]))
 
 

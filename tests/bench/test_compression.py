@@ -54,7 +54,10 @@ def test_the_table_and_the_plot_have_every_row(tmp_path, capsys):
     printed, picture = capsys.readouterr().out, drawn.read_text()
     for name in rows:
         assert f"| {name} |" in printed
-        assert f">{name}</text>" in picture
+        assert f"<title>{name}</title>" in picture
+    assert [picture.count(f">{line}</text>") for line in ("learned", "dead zone of changes", "fewer", "high")] == [
+        1
+    ] * 4
     for noise in ("3e-08", "1e-07"):
         plain, dead = rows[f"learned, noise {noise}"], rows[f"dead zone of changes, noise {noise}"]
         assert dead["bytes"] < plain["bytes"]
