@@ -18,6 +18,8 @@ RINGS = ((-30.0, CLOSE), (0.0, CLOSE), (30.0, CLOSE), (60.0, CLOSE), (-15.0, WHO
 """How far above the scene's middle cameras stand, degrees"""
 HELD_OUT = (15.0, CLOSE)
 """The ring from which nothing is learned: in the middle between two others, its cameras between theirs"""
+FRAMES = 30
+"""In which the scene is looked for at most, spread evenly"""
 UNTOLD_UP = (0.0, 0.0, 1.0)
 """World, where a scene says nothing of it: the axis of the UV map, and what the viewer takes for it"""
 
@@ -30,7 +32,7 @@ def looked_at(scene: Scene) -> SceneHeader:
     header = scene.header
     if header.filmed:
         return header
-    shown = (drawn(scene.gaussians(frame)) for frame in range(len(scene)))
+    shown = (drawn(scene.gaussians(frame)) for frame in range(0, len(scene), -(-len(scene) // FRAMES)))
     spheres = [[middle(g, share=look.share) for look in (CLOSE, WHOLE)] for g in shown if len(g)]
     if not spheres:
         raise ValueError(f"{scene.path} must show something to be compressed, but has no Gaussian that is drawn")
