@@ -4,15 +4,15 @@
     packuv bench codec --frames 30 --keyframes 4 --out runs/codec.json          # a made-up sequence
     packuv bench codec --segments S0.npz S1.npz --quantizer quantizer.json --out runs/codec.json
 
-`compact` rows are scene files, lossless and at each quality, written, verified and read. `plain atlas` codes every
-byte plane of the whole 2048 x 1024 atlas in every frame, as the paper does; `codes` rows the bytes of all Gaussians in
-every frame, in the order and mosaic of the scene file but without its differences between frames; `pictures` rows the
-compact file's own pictures; these must give back every byte. Rows named as a format are what `packuv export` writes,
-read again: a file a frame, of which the frames that are drawn are measured, or all frames in one. Distortion is the
-PSNR of renders from cameras that were not fitted against renders of the lossless scene and, with --capture, against
-what those cameras filmed. Noise of a made-up sequence is known, so its last row says what no codec is below that keeps
-the keys as they are. Wall time on a shared machine is noisy: compare rows of one run, and CPU seconds, which count
-all threads.
+`compact` rows are scene files, lossless and at each quality, written, verified and read. `plain atlas` codes every byte
+plane of the whole 2048 x 1024 atlas in every frame, as the paper does; `codes` rows the bytes of all Gaussians in every
+frame, in the order and mosaic of the scene file but without its differences between frames; `pictures` rows the compact
+file's own pictures, as a video or, with WebP and JPEG XL, each alone; these must give back every byte. Rows named as a
+format are what `packuv export` writes, read again: a file a frame, of which the frames that are drawn are measured, or
+all frames in one. Distortion is the PSNR of renders from cameras that were not fitted against renders of the lossless
+scene and, with --capture, against what those cameras filmed. Noise of a made-up sequence is known, so its last row says
+what no codec is below that keeps the keys as they are. Wall time on a shared machine is noisy: compare rows of one run,
+and CPU seconds, which count all threads.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ import argparse
 import json
 import os
 import shlex
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -36,6 +37,7 @@ import numpy as np
 from bench import command
 from bench.doors import MEASURED, USUAL, Pictures, measure_doors
 from bench.entropy import channel_bits
+from bench.front_end import COLOURS
 from bench.made_up import CAMERA, NEAR, SequenceOptions, find_gaussians, make_sequence
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer
 from packuv.gaussians.segment import Segment
@@ -58,6 +60,8 @@ class Codec:
     pixels: str
     """Pixel format; of those with colour only the luma carries data"""
     options: tuple[tuple[str, str], ...] = ()
+    by_program: bool = False
+    """Whether the `ffmpeg` on PATH codes it, a process a track, for PyAV has no such encoder"""
 
 
 CODECS = {
@@ -67,6 +71,8 @@ CODECS = {
     "hevc": Codec("libx265", "yuv420p", (("x265-params", "lossless=1:log-level=error"), ("preset", "medium"))),
     "vp9": Codec("libvpx-vp9", "yuv420p", (("lossless", "1"), ("cpu-used", "4"))),
     "av1": Codec("libsvtav1", "yuv420p", (("svtav1-params", "lossless=1"), ("preset", "8"))),
+    "webp": Codec("libwebp", "bgra", (("lossless", "1"),)),
+    "jxl": Codec("libjxl", "gray", (("distance", "0"), ("effort", "7"), ("modular", "1")), by_program=True),
 }
 ALONE = ("ffv1", "hevc")
 """Of these, those that also code the codes themselves: one that knows no other frame, and one that finds its own"""
@@ -185,7 +191,7 @@ def _bytes(codes: Codes) -> np.ndarray:
 def measure_codecs(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:
     """The pictures of both tracks of a scene file through other codecs, each track as one video; and its codes."""
     with open_scene(path) as scene:
-        tracks = [list(_pictures(scene, number)) for number in range(len(scene.index.tracks))]
+        tracks = [pictures for number in range(len(scene.index.tracks)) if (pictures := list(_pictures(scene, number)))]
         codes = list(_undifferenced(scene))
         rows = sum(segment.rows * segment.frames for segment in scene.index.segments)
     for name in names:
@@ -202,8 +208,9 @@ def _through(
     start = time.perf_counter()
     try:
         coded = [_code(codec, pictures) for pictures in tracks]
-    except (av.FFmpegError, ValueError) as error:
-        return {"layout": label, "skipped": str(error)}
+    except (av.FFmpegError, ValueError, OSError, subprocess.CalledProcessError) as error:
+        told = error.stderr.decode().strip() if isinstance(error, subprocess.CalledProcessError) else ""
+        return {"layout": label, "skipped": told.split("\n")[-1] or str(error)}
     written = time.perf_counter()
     shapes = [pictures[0].shape for pictures in tracks]
     found = [_decoded(codec, *pair) for pair in zip(coded, shapes, strict=True)]
@@ -244,6 +251,8 @@ def _pictures(scene: Scene, track: int) -> Iterator[np.ndarray]:
 
 def _code(codec: Codec, pictures: Sequence[np.ndarray]) -> tuple[list[bytes], bytes | None]:
     """Packets in coding order, and the stream's own header."""
+    if codec.by_program:
+        return _by_program(codec, pictures), None
     context = av.CodecContext.create(codec.encoder, "w")
     assert isinstance(context, av.VideoCodecContext)
     context.height, context.width = pictures[0].shape
@@ -265,21 +274,58 @@ def _framed(picture: np.ndarray, pixels: str) -> np.ndarray:
     """The picture as luma, with chroma of nothing below where the format wants one."""
     if pixels == "gray":
         return picture
+    if pixels == "bgra":
+        return np.stack([picture] * 3 + [np.full_like(picture, 255)], axis=2)
     return np.concatenate([picture, np.full((picture.shape[0] // 2, picture.shape[1]), 128, np.uint8)])
+
+
+def _by_program(codec: Codec, pictures: Sequence[np.ndarray]) -> list[bytes]:
+    """A file of each picture. Raises OSError without the program, CalledProcessError where that has no such codec."""
+    height, width = pictures[0].shape
+    options = [word for name, value in codec.options for word in (f"-{name}", value)]
+    with tempfile.TemporaryDirectory() as folder:
+        source = ["-f", "rawvideo", "-pixel_format", "gray", "-video_size", f"{width}x{height}", "-i", "-"]
+        target = ["-c:v", codec.encoder, *options, "-threads", "1", f"{folder}/%06d.jxl"]
+        raw = b"".join(picture.tobytes() for picture in pictures)
+        _ffmpeg([*source, *target], raw)
+        return [path.read_bytes() for path in sorted(Path(folder).iterdir())]
+
+
+def _from_program(files: Sequence[bytes], shape: tuple[int, ...]) -> list[np.ndarray]:
+    """The pictures of such files."""
+    with tempfile.TemporaryDirectory() as folder:
+        for number, content in enumerate(files, start=1):
+            Path(folder, f"{number:06d}.jxl").write_bytes(content)
+        source = ["-threads", "1", "-i", f"{folder}/%06d.jxl"]
+        raw = _ffmpeg([*source, "-f", "rawvideo", "-pix_fmt", "gray", "-"], b"")
+    return list(np.frombuffer(raw, np.uint8).reshape(-1, *shape))
+
+
+def _ffmpeg(words: Sequence[str], given: bytes) -> bytes:
+    command = ["ffmpeg", "-hide_banner", "-loglevel", "error", *words]
+    return subprocess.run(command, input=given, capture_output=True, check=True).stdout
 
 
 def _decoded(codec: Codec, coded: tuple[list[bytes], bytes | None], shape: tuple[int, ...]) -> list[np.ndarray]:
     """The pictures of packets, uint8 [height, width] each."""
     packets, header = coded
+    if codec.by_program:
+        return _from_program(packets, shape)
     encoder = av.CodecContext.create(codec.encoder, "w").codec
-    names = {"libx264": "h264", "libx265": "hevc", "libvpx-vp9": "vp9", "libsvtav1": "libdav1d"}
+    names = {"libx264": "h264", "libx265": "hevc", "libvpx-vp9": "vp9", "libsvtav1": "libdav1d", "libwebp": "webp"}
     context = av.CodecContext.create(names.get(codec.encoder, encoder.name), "r")
     assert isinstance(context, av.VideoCodecContext)
     context.extradata = header
     context.height, context.width = height, width = shape
     frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
     frames += context.decode(None)
-    return [frame.to_ndarray()[:height, :width] for frame in frames]
+    return [_gray(frame)[:height, :width] for frame in frames]
+
+
+def _gray(frame: av.VideoFrame) -> np.ndarray:
+    """Its luma, or one of its colours, which are all alike."""
+    found = frame.to_ndarray()
+    return found[:, :, 1] if found.ndim == 3 else found
 
 
 # Command
@@ -313,7 +359,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(results, indent=1) + "\n")
     if options.plot:
-        options.plot.write_text(plot(results["rows"]))
+        options.plot.write_text(plot(points(results["rows"]), "MB per 30 frames"))
     print(table(results["rows"]))
 
 
@@ -436,41 +482,70 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def _loss(row: dict[str, Any]) -> str:
     if row["exact"]:
         return "exact"
-    decibel = row.get("psnr_to_lossless_db")
-    return "NOT EXACT" if decibel is None else f"{decibel:.2f}"
+    if "psnr_to_lossless_db" not in row:
+        return "NOT EXACT"
+    decibel = row["psnr_to_lossless_db"]
+    return "equal" if decibel is None else f"{decibel:.2f}"
 
 
-def plot(rows: Sequence[dict[str, Any]]) -> str:
-    """Rate against distortion as SVG: size on a logarithmic scale, lossless layouts along the top."""
+def points(rows: Sequence[dict[str, Any]]) -> list[Point]:
+    """For the plot: MB of 30 frames."""
     sized = [row for row in rows if "bytes" in row]
-    points = [(row["bytes"] * 30 / row["frames"] / 1e6, row.get("psnr_to_lossless_db"), row["layout"]) for row in sized]
-    known = [decibel for _, decibel, _ in points if decibel]
-    low, high = np.log10([min(p[0] for p in points) * 0.8, max(p[0] for p in points) * 1.3])
+    return [(row["bytes"] * 30 / row["frames"] / 1e6, row.get("psnr_to_lossless_db"), row["layout"]) for row in sized]
+
+
+Point = tuple[float, float | None, str]
+"""Size in MB, PSNR in dB or None where it is lossless, and name"""
+
+
+def plot(marked: Sequence[Point], what: str, lines: Mapping[str, Sequence[Point]] | None = None) -> str:
+    """Rate against distortion as SVG: size on a logarithmic scale, lossless layouts along the top; points with their
+    names, and lines of points, whose names stand in the corner."""
+    lines = lines or {}
+    everything = [*marked, *(point for line in lines.values() for point in line)]
+    known = [decibel for _, decibel, _ in everything if decibel]
+    low, high = np.log10([min(p[0] for p in everything) * 0.8, max(p[0] for p in everything) * 1.3])
     bottom, top = min(known, default=40) - 2, max(known, default=40) + 6
-    marks = [_axes(low, high, bottom, top)]
-    for number, (size, decibel, label) in enumerate(sorted(points, key=lambda point: (point[1] is None, point[0]))):
-        x = 70 + (np.log10(size) - low) / (high - low) * 820
+    marks = [_axes(low, high, bottom, top, what)]
+
+    def place(size: float, decibel: float | None) -> tuple[float, float]:
         y = 40 if decibel is None else 60 + (top - decibel) / (top - bottom) * 380
-        place = y + 4 if decibel else y + 18 + 16 * (number % 6)
-        marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4"/><text x="{x + 7:.1f}" y="{place:.1f}">{label}</text>')
+        return 70 + (np.log10(size) - low) / (high - low) * 820, y
+
+    for number, (name, line) in enumerate(lines.items()):
+        colour = COLOURS[number % len(COLOURS)]
+        path = "L".join(f"{x:.1f} {y:.1f}" for x, y in (place(size, decibel) for size, decibel, _ in line))
+        marks.append(f'<path d="M{path}" fill="none" stroke="{colour}"/>')
+        marks.append(f'<text x="90" y="{64 + 18 * number}" fill="{colour}" font-weight="bold">{name}</text>')
+        marks += [_dot(*place(size, decibel), label, colour) for size, decibel, label in line]
+    below = 0
+    for size, decibel, label in sorted(marked, key=lambda point: (point[1] is None, point[0])):
+        x, y = place(size, decibel)
+        under = y + 4 if decibel else y + 18 + 16 * (below % 6)
+        below += decibel is None
+        marks.append(_dot(x, y, label, "black") + f'<text x="{x + 7:.1f}" y="{under:.1f}">{label}</text>')
     body = "".join(marks)
     head = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1060 500" font-family="sans-serif" font-size="12">'
     return f"{head}{body}</svg>\n"
 
 
-def _axes(low: float, high: float, bottom: float, top: float) -> str:
+def _dot(x: float, y: float, label: str, colour: str) -> str:
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"><title>{label}</title></circle>'
+
+
+def _axes(low: float, high: float, bottom: float, top: float, what: str) -> str:
     parts = ['<rect width="1060" height="500" fill="white"/><path d="M70 40V450H890" fill="none" stroke="black"/>']
-    parts.append(
-        '<text x="480" y="490" text-anchor="middle">MB per 30 frames</text><text x="75" y="30">lossless</text>'
-    )
+    parts.append(f'<text x="480" y="490" text-anchor="middle">{what}</text><text x="75" y="30">lossless</text>')
     parts.append('<text x="16" y="250" transform="rotate(-90 16 250)" text-anchor="middle">PSNR to lossless, dB</text>')
-    for size in (1, 2, 3, 5, 10, 20, 50, 100, 200, 500):
+    for size in (step * 10.0**decade for decade in range(-3, 3) for step in (1, 2, 3, 5)):
         if low <= np.log10(size) <= high:
             x = 70 + (np.log10(size) - low) / (high - low) * 820
             parts.append(
-                f'<path d="M{x:.1f} 450v5" stroke="black"/><text x="{x:.1f}" y="468" text-anchor="middle">{size}</text>'
+                f'<path d="M{x:.1f} 450v5" stroke="black"/>'
+                f'<text x="{x:.1f}" y="468" text-anchor="middle">{size:g}</text>'
             )
-    for decibel in range(int(np.ceil(bottom)), int(top) + 1, 2):
+    spacing = 2 if top - bottom < 50 else 5
+    for decibel in range(spacing * int(np.ceil(bottom / spacing)), int(top) + 1, spacing):
         y = 60 + (top - decibel) / (top - bottom) * 380
         parts.append(f'<text x="62" y="{y + 4:.1f}" text-anchor="end">{decibel}</text>')
     return "".join(parts)

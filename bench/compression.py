@@ -1,11 +1,13 @@
-"""Size against distortion of one scene: lossless, by tolerance, by learned steps, with fewer Gaussians whose codes are
-moved to make up for the others, and with one attribute coarse alone.
+"""Size against distortion of one scene: lossless, by tolerance, by learned steps, these with dead zones, with fewer
+Gaussians whose codes are moved to make up for the others, and with one attribute coarse alone.
 
-    packuv bench compression --scene scene.mkv --out bench/results/compression_NAME.json
+    packuv bench compression --scene scene.mkv --out bench/results/compression_NAME.json --plot compression_NAME.svg
 
-Distortion is that of pictures of the scene's cameras, the lossless scene being the truth; SSIM and "unseen" are of
-cameras that were not fitted, from which no step was learned. Every row is a scene file that was written, verified and
-read again.
+Dead zones are about where a code was in the frame before, or about 0 in bands of view dependence; a scene without
+frames after a key has no rows of the one, one of SH degree 0 none of the other. Distortion is that of pictures of the
+scene's cameras, the lossless scene being the truth; SSIM and "unseen" are of cameras that were not fitted, from which
+no step was learned; cameras are imagined where nobody filmed the scene. Every row is a scene file that was written,
+verified and read again.
 """
 
 from __future__ import annotations
@@ -16,26 +18,33 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench import command
+from bench.codec import Point, plot
 from packuv.compress import ITERATIONS
 from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import Steps
-from packuv.gaussians.codes import attribute_count
+from packuv.gaussians.codes import OPACITY, REST, Codes, attribute_count
+from packuv.gaussians.segment import Segment
 from packuv.metrics import decibels, ssim
 from packuv.progress import Ticks, no_progress
 from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, Tolerance, write_scene
 
 KINDS = {"position": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 9), "opacity": slice(9, 10)}
 """Of the 3 + A kinds of codes; colours are the rest"""
+DEAD = 5 / 6
+"""Of a step: as far from where it was a code in a dead zone stays there, which rounding lets go half a step away"""
+NOUGHT = 128
+"""Code of 0 of bands above 0, in learned steps"""
 RAW_BITS = 8
 """Of an attribute's code; a coordinate has twice as many"""
 
@@ -47,19 +56,27 @@ class _Table:
         self._scene, self._folder, self._judge = scene, folder, Judge(scene)
         self.segments = [scene.segment(number) for number in range(len(scene.index.segments))]
         self.codes = sum(len(part.key) * len(part) for part in self.segments)
-        self.sensitivity = sensitivity(scene, self._judge.learned, self._judge.frames)
+        self.sensitivity = sensitivity(scene, self._judge.learned, self._judge.frames, near=self._judge.near)
 
-    def row(self, name: str, tolerance: Tolerance, steps: Steps | None = None) -> dict[str, Any]:
-        """Size and distortion of the scene so written."""
+    def row(
+        self,
+        name: str,
+        tolerance: Tolerance,
+        steps: Steps | None = None,
+        dead: Callable[[Segment], Segment] | None = None,
+    ) -> dict[str, Any]:
+        """Size and distortion of the scene so written; with `dead` zones in its steps."""
         paths = [self._folder / f"{number}.npz" for number in range(len(self.segments))]
         for path, segment in zip(paths, self.segments, strict=True):
-            (steps.segment(segment) if steps else segment).save(path)
+            coarse = steps.segment(segment) if steps else segment
+            (dead(coarse) if dead else coarse).save(path)
         return self._measured(name, paths, tolerance, steps)
 
     def fewer(self, noise: float, steps: Steps) -> dict[str, Any]:
         """The same of the rows that are worth their bits, moved to make up for the others."""
         started = time.perf_counter()
-        rows = Rows(self._scene, self._judge.views, self._folder, seed=0, ticks=Ticks(no_progress, 1))
+        judge, ticks = self._judge, Ticks(no_progress, 1)
+        rows = Rows(self._scene, judge.views, self._folder, near=judge.near, seed=0, ticks=ticks)
         paths = rows.coarse(noise, steps, ITERATIONS)
         facts = {"rows": rows.kept / rows.count, "seconds": round(time.perf_counter() - started, 1)}
         return {**self._measured(f"fewer, noise {noise:g}", paths, steps.tolerance, steps), **facts}
@@ -76,6 +93,30 @@ class _Table:
             "bits_per_gaussian_and_frame": written.bytes * 8 / self.codes,
             **distortion(self._judge, file),
         }
+
+
+def held(segment: Segment, tolerance: Tolerance) -> Segment:
+    """A segment whose codes stay where they are until they are DEAD steps of the tolerance away from there."""
+    zones = [DEAD * step for step in tolerance.steps]
+    now = [segment.xyz.copy(), segment.attributes.copy()]
+    start = segment.key[segment.dynamic]
+    before = [start.xyz, start.attributes]
+    for places, attributes in zip(*now, strict=True):
+        stays = (attributes[:, OPACITY] > 0) == (before[1][:, OPACITY] > 0)  # nobody comes or goes later
+        for codes, last, zone in zip((places, attributes), before, zones, strict=True):
+            near = stays[:, None] & (np.abs(codes.astype(np.int64) - last) <= zone)
+            codes[near] = last[near]
+        before = [places, attributes]
+    return replace(segment, xyz=now[0], attributes=now[1])
+
+
+def quiet(segment: Segment) -> Segment:
+    """A segment in learned steps whose coefficients of bands above 0 are 0 up to a step beside it."""
+    key, moving = segment.key.attributes.copy(), segment.attributes.copy()
+    for codes in (key, moving):
+        bands = codes[..., REST:]
+        bands[np.abs(bands.astype(int) - NOUGHT) <= 1] = NOUGHT
+    return replace(segment, key=Codes(segment.key.xyz, key), attributes=moving)
 
 
 def distortion(judge: Judge, file: Path) -> dict[str, float | None]:
@@ -107,6 +148,13 @@ def measure(scene: Scene, folder: Path, *, noises: Sequence[float], coarse_bits:
         found = table.row(f"learned, noise {noise:g}", steps.tolerance, steps)
         yield {**found, "position_steps": steps.position.tolist(), "attribute_steps": steps.attribute.tolist()}
     for noise in noises:
+        steps = Steps.of_noise(noise, table.sensitivity, quantizer)
+        if any(segment.xyz.size for segment in table.segments):
+            zone = partial(held, tolerance=steps.tolerance)
+            yield table.row(f"dead zone of changes, noise {noise:g}", steps.tolerance, steps, zone)
+        if quantizer.sh_degree:
+            yield table.row(f"dead zone of bands, noise {noise:g}", steps.tolerance, steps, quiet)
+    for noise in noises:
         yield table.fewer(noise, Steps.of_noise(noise, table.sensitivity, quantizer))
     count = attribute_count(quantizer.sh_degree)
     for name, kinds in {**KINDS, "colour": slice(10, 3 + count)}.items():
@@ -133,6 +181,16 @@ def table(rows: Sequence[dict[str, Any]], raw_bits: float) -> str:
     return "\n".join(lines)
 
 
+def drawn(rows: Sequence[dict[str, Any]]) -> str:
+    """The plot: a line through what differs in its noise alone."""
+    alone, lines = list[Point](), dict[str, list[Point]]()
+    for row in rows:
+        way, by_noise, _ = row["name"].partition(", noise ")
+        point = row["bytes"] / 1e6, row["psnr_db"], row["name"]
+        (lines.setdefault(way, []) if by_noise else alone).append(point)
+    return plot(alone, "MB", lines)
+
+
 def facts_of(scene: Scene, benchmark: str, words: Sequence[str]) -> dict[str, Any]:
     """What was measured, and by which command."""
     entry, degree = scene.index.segments[0], scene.header.quantizer.sh_degree
@@ -155,6 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--noises", type=float, nargs="+", default=[1e-7, 1e-6, 1e-5, 1e-4, 1e-3], help="of learned steps"
     )
+    parser.add_argument("--plot", type=Path, help="size against PSNR, SVG to write")
     parser.add_argument("--coarse-bits", type=int, default=6, help="of an attribute that is coarse alone")
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = parser.parse_args(words)
@@ -165,6 +224,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(row, file=sys.stderr, flush=True)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")
+    if options.plot:
+        options.plot.write_text(drawn(rows))
     print(table(rows, facts["raw_bits"]))
 
 

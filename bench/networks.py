@@ -79,7 +79,9 @@ class _Bench:
         self._scene, self._folder, self._judge = scene, folder, Judge(scene)
         self._iterations, self._seed = iterations, seed
         self._segment = scene.segment(0)
-        self._squares = row_sensitivity(scene, self._judge.learned, self._judge.frames, seed=seed)
+        self._squares = row_sensitivity(
+            scene, self._judge.learned, self._judge.frames, near=self._judge.near, seed=seed
+        )
         self._around = neighbours(len(self._segment.key))
 
     def rows(self, noise: float, named: str) -> Iterator[dict[str, Any]]:

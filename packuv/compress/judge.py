@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from packuv.colour import lit
+from packuv.compress.imagined import IMAGINED, looked_at
 from packuv.compress.views import Views
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene, open_scene
@@ -21,18 +22,21 @@ class Judge:
     """Pictures of a scene, to which those of others are compared."""
 
     def __init__(self, scene: Scene) -> None:
-        header = scene.header
+        header = looked_at(scene)
         held_out = [camera for camera in header.cameras if camera.name in header.held_out]
         fitted = [camera for camera in header.cameras if camera.name not in header.held_out]
         unseen = _spread(held_out, CAMERAS // 3 if fitted else CAMERAS)
         self.learned = _spread(fitted, CAMERAS - len(unseen)) or unseen
         """Cameras from which sensitivity is learned"""
-        self.views = Views(fitted or unseen)
+        self.views = Views(fitted or unseen, filmed=header is scene.header)
         """From which rows are weighed and tuned"""
         self.cameras = tuple(self.learned) + tuple(camera for camera in unseen if camera not in self.learned)
         self.frames = tuple(_spread(range(len(scene)), FRAMES))
         self._unseen = {camera.name for camera in self.cameras} - {camera.name for camera in self.learned}
-        self._options, self._arena = RasterOptions(near=header.near), Arena()
+        self.near = header.near
+        self.imagined = header.extra.get(IMAGINED)
+        """What imagined cameras circle, JSON; None where the cameras are the scene's own"""
+        self._options, self._arena = RasterOptions(near=self.near), Arena()
         self._truth = {(frame, name): picture for frame, name, picture in self._pictures(scene)}
 
     def errors(self, path: Path) -> tuple[float, float | None]:

@@ -35,9 +35,9 @@ class _Part:
 class Rows:
     """Segments of a scene, one in memory at a time."""
 
-    def __init__(self, scene: Scene, views: Views, folder: Path, *, seed: int, ticks: Ticks) -> None:
+    def __init__(self, scene: Scene, views: Views, folder: Path, *, near: float, seed: int, ticks: Ticks) -> None:
         self._views, self._seed, self._ticks = views, seed, ticks
-        self._quantizer, self._near = scene.header.quantizer, scene.header.near
+        self._quantizer, self._near = scene.header.quantizer, near
         self._parts: list[_Part] = []
         self.count = self.kept = 0
         """Rows of all segments, and of the last trial"""

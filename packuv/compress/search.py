@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from packuv.compress.imagined import IMAGINED
 from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
@@ -29,6 +30,8 @@ AGAIN, CORRECTIONS = 4, 3
 FINEST = 1e-10
 """Noise of the finest steps that are tried, mean squared error of each kind of code"""
 COARSEST = 0.03
+EXACT = 1e-12
+"""Mean squared error of pictures that are told apart from equal ones, which have no PSNR"""
 LONGEST = {"psnr_db": -100.123, "psnr_held_out_db": -100.123, "loss_db": -100.1234}
 """Figures that take as many characters as any, in the header of trials"""
 RATIO_TOLERANCE, LOSS_TOLERANCE = 0.02, 0.03
@@ -97,6 +100,8 @@ class Compressed:
     steps: Steps
     rows: float
     """Share of the rows of all segments that are still there"""
+    imagined: bool
+    """Whether the pictures are of imagined cameras, as nobody filmed the scene"""
 
     @property
     def ratio(self) -> float:
@@ -115,10 +120,10 @@ def compress(
 ) -> Compressed:
     """Write a smaller scene file of a lossless one; the same input gives the same bytes.
 
-    Distortion is that of the scene's own cameras, the lossless scene being the truth. `iterations` are those of each
-    segment in which codes are moved to make up for what is left out; with 0 they stay where they are. Raises
-    ValueError where the scene is not lossless, or has no cameras; where no steps reach the goal, with what can be
-    reached.
+    Distortion is that of the scene's own cameras, or of imagined ones where nobody filmed it, the lossless scene being
+    the truth. `iterations` are those of each segment in which codes are moved to make up for what is left out; with 0
+    they stay where they are. Raises ValueError where the scene is not lossless, shows nothing, or is too small to get
+    smaller; where no steps reach the goal, with what can be reached.
     """
     if iterations < 0:
         raise ValueError(f"iterations must be 0 or more, but are {iterations}")
@@ -145,15 +150,20 @@ class _Work:
         trials = self._pictures * (TRIALS + len(self._passes))
         tuned = DRAWN * len(segments) * sum(self._passes)
         self._ticks = Ticks(progress, first + trials + tuned + 1)
-        self._sensitivity = sensitivity(scene, learned, self._judge.frames, seed=seed, ticks=self._ticks)
-        self._rows = Rows(scene, self._judge.views, folder, seed=seed, ticks=self._ticks)
+        near, ticks = self._judge.near, self._ticks
+        self._sensitivity = sensitivity(scene, learned, self._judge.frames, near=near, seed=seed, ticks=ticks)
+        if not self._sensitivity.any():
+            raise ValueError(f"{scene.path} must show something to be compressed, but its cameras see nothing")
+        self._rows = Rows(scene, self._judge.views, folder, near=near, seed=seed, ticks=ticks)
         self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
         self._sound = scene.sound()
 
     def search(self) -> Compressed:
         """What is nearest to the goal on its safe side, its segments kept: no larger than asked for, no worse than
         allowed. Codes as they are tell about where that is, moved ones where exactly."""
-        return self._tune(self._bisect())
+        found = self._tune(self._bisect())
+        self._check_smaller(found)
+        return found
 
     def _bisect(self) -> Compressed:
         """What is nearest to the goal on its safe side, codes being as they are."""
@@ -197,6 +207,7 @@ class _Work:
         return best
 
     def _check_reach(self, fine: Compressed, coarse: Compressed) -> None:
+        self._check_smaller(fine if fine.bytes < coarse.bytes else coarse)
         (least, wanted, _), (most, _, _) = (self._goal.told(trial) for trial in (fine, coarse))
         if least < wanted <= most:
             return
@@ -206,6 +217,13 @@ class _Work:
             f"{self._scene.path} can be made {what.format(least, most)}, but {asked} is asked for; ask for what lies "
             "between"
         )
+
+    def _check_smaller(self, found: Compressed) -> None:
+        if found.bytes >= self._source_bytes:
+            raise ValueError(
+                f"{self._scene.path} has {self._source_bytes} bytes and must get smaller by compression, but gets no "
+                "smaller: its header says more then; keep it as it is, or allow more loss"
+            )
 
     def write(self, target: Path, found: Compressed) -> Compressed:
         """The file itself, of the segments that were kept, whose header says what was done to them."""
@@ -227,10 +245,11 @@ class _Work:
         size = self._encode(path, segments, steps, rows, LONGEST)
         error, unseen = self._judge.errors(path)
         self._ticks.advance(self._pictures)
-        psnr_db = decibels(error)
-        unseen_db = None if unseen is None else decibels(unseen)
+        psnr_db = decibels(max(error, EXACT))
+        unseen_db = None if unseen is None else decibels(max(unseen, EXACT))
         loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)
-        return Compressed(self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps, rows)
+        imagined = self._judge.imagined is not None
+        return Compressed(self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps, rows, imagined)
 
     def _encode(
         self, path: Path, segments: Sequence[Path], steps: Steps, rows: float, figures: Mapping[str, Any]
@@ -253,6 +272,7 @@ class _Work:
             "fitted_db": self._goal.fitted_db,
             "cameras": [camera.name for camera in self._judge.cameras],
             "frames": list(self._judge.frames),
+            **({IMAGINED: self._judge.imagined} if self._judge.imagined else {}),
         }
 
 
@@ -270,8 +290,6 @@ def _check_lossless(scene: Scene) -> None:
         raise ValueError(
             f"{scene.path} must be lossless to be compressed, but is lossy already; take the file that it was made from"
         )
-    if not scene.header.cameras:
-        raise ValueError(f"{scene.path} must hold the cameras whose pictures tell the loss, but holds none")
 
 
 def _digest(scene: Scene) -> str:

@@ -18,7 +18,13 @@ LEAST_W = 1e-3
 
 
 def sensitivity(
-    scene: Scene, cameras: Sequence[PinholeCamera], frames: Sequence[int], *, seed: int = 0, ticks: Ticks | None = None
+    scene: Scene,
+    cameras: Sequence[PinholeCamera],
+    frames: Sequence[int],
+    *,
+    near: float,
+    seed: int = 0,
+    ticks: Ticks | None = None,
 ) -> np.ndarray:
     """Mean squared error of a picture for one step of error in the codes of each kind, float64 [3 + A].
 
@@ -28,28 +34,34 @@ def sensitivity(
     of J's squares as their mean: one pass for each picture tells all.
     """
     kinds, samples = np.zeros(3 + len(scene.header.quantizer.low)), 0
-    for squares, count in _squares(scene, cameras, frames, seed=seed, ticks=ticks):
+    for squares, count in _squares(scene, cameras, frames, near, seed=seed, ticks=ticks):
         kinds += squares.sum(axis=0)
         samples += count
     return kinds / samples
 
 
 def row_sensitivity(
-    scene: Scene, cameras: Sequence[PinholeCamera], frames: Sequence[int], *, seed: int = 0
+    scene: Scene, cameras: Sequence[PinholeCamera], frames: Sequence[int], *, near: float, seed: int = 0
 ) -> np.ndarray:
     """The same of each row, float64 [N, 3 + A], from frames of one segment."""
     total, samples = np.zeros(0), 0
-    for squares, count in _squares(scene, cameras, frames, seed=seed):
+    for squares, count in _squares(scene, cameras, frames, near, seed=seed):
         total = total + squares if samples else squares
         samples += count
     return total / samples
 
 
 def _squares(
-    scene: Scene, cameras: Sequence[PinholeCamera], frames: Sequence[int], *, seed: int, ticks: Ticks | None = None
+    scene: Scene,
+    cameras: Sequence[PinholeCamera],
+    frames: Sequence[int],
+    near: float,
+    *,
+    seed: int,
+    ticks: Ticks | None = None,
 ) -> Iterator[tuple[np.ndarray, int]]:
     """By picture: squared derivatives by the codes of each row [N, 3 + A], and how many values it has."""
-    rng, options = np.random.default_rng(seed), RasterOptions(near=scene.header.near)
+    rng, options = np.random.default_rng(seed), RasterOptions(near=near)
     for frame in frames:
         codes = scene.codes(frame)
         gaussians = scene.header.quantizer.decode(codes)

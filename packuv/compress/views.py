@@ -20,8 +20,10 @@ LEAST, MOST = -0.3, 0.6
 class Views:
     """Cameras of a scene, and more between and beside them: who never looks from elsewhere fits what he sees alone."""
 
-    def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
+    def __init__(self, cameras: Sequence[PinholeCamera], *, filmed: bool = True) -> None:
         self._cameras = tuple(cameras)
+        self.filmed = filmed
+        """Whether they filmed the scene, so that what lies beside all their pictures was never meant to be seen"""
         self._centres = np.array([camera.centre for camera in cameras])
 
     def __len__(self) -> int:

@@ -6,6 +6,7 @@ from itertools import islice
 
 import numpy as np
 
+from packuv.camera import PinholeCamera
 from packuv.compress.views import Views
 from packuv.gaussians.codes import OPACITY, Quantizer
 from packuv.gaussians.segment import Segment
@@ -23,7 +24,8 @@ def weigh(
 ) -> np.ndarray:
     """Largest share of a picture that each row makes up, float32 [N]: its blending weights over the pixels.
 
-    Infinite where a row is in none of the frames that were drawn: nothing is known of it.
+    Infinite where a row is in none of the frames that were drawn, or where nobody filmed the scene beside all
+    pictures: nothing is known of it.
     """
     most, known = np.zeros(len(segment.key), np.float32), np.zeros(len(segment.key), bool)
     options, arena, frames = RasterOptions(near=near), Arena(), _spread(len(segment))
@@ -32,12 +34,20 @@ def weigh(
     for index in frames:
         codes = segment.frame(index)
         gaussians = quantizer.decode(codes)
-        known |= codes.attributes[:, OPACITY] > 0
+        there = codes.attributes[:, OPACITY] > 0
         for camera in islice(cameras, count):
             drawn = render(gaussians, camera, options=options, weights=True, arena=arena)
             most = np.maximum(most, drawn.weights / (camera.width * camera.height))
+            known |= there if views.filmed else there & _before(camera, gaussians.means, near)
             ticks.advance()
     return np.where(known, most, np.float32(np.inf))
+
+
+def _before(camera: PinholeCamera, means: np.ndarray, near: float) -> np.ndarray:
+    """Which of points [N, 3] lie within the picture of a camera, bool [N]."""
+    pixels, depth = camera.project(means.astype(np.float64))
+    inside = (pixels >= 0) & (pixels <= (camera.width, camera.height))
+    return np.logical_and(inside.all(axis=1), depth > near)
 
 
 def pictures_of(frames: int, cameras: int) -> int:

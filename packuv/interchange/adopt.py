@@ -19,6 +19,7 @@ import numpy as np
 from packuv.bounds import MOST_NUMBER
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, SCALE, Codes, Quantizer, attribute_values
 from packuv.gaussians.floats import DRAWN_LOGIT, SH_C0, Gaussians, drawn, opacity, rows_of, with_canonical_axes
+from packuv.gaussians.orbit import OrbitOptions, around, middle, near_of, orbit
 from packuv.gaussians.rows import first_appearance, with_rows
 from packuv.gaussians.segment import Segment
 from packuv.gaussians.uvmap import assign_slots, choose_centre
@@ -26,9 +27,10 @@ from packuv.gaussians.uvsize import UvOptions
 from packuv.interchange import antialiased, is_splats, read_gaussians
 from packuv.interchange.clip import ANTIALIASED
 from packuv.interchange.joined import equal_codes, segments_of
-from packuv.interchange.orbit import OrbitOptions, around, likeness, middle, near_of, orbit
+from packuv.interchange.likeness import likeness
 from packuv.progress import Progress, no_progress, part_of
 from packuv.scene import SceneHeader, open_scene, write_scene
+from packuv.scene.header import ADOPTED
 
 TAILS = (5e-5, 5e-4, 5e-3, 0.01, 0.02)
 """Shares of the values at either end of a column that its range need not hold; one stray value would coarsen all. The
@@ -184,7 +186,7 @@ def _header(survey: _Survey, frames: Sequence[Path], options: AdoptOptions) -> S
     cameras = orbit(*around(survey.spheres), options=options.orbit)
     times = np.array([round(index * 10**9 / options.rate) for index in range(len(frames))], dtype=np.int64)
     source = {"files": len(frames), "first": frames[0].name, "uv": None if options.uv is None else vars(options.uv)}
-    extra = {"near": near_of(cameras), "adopted": source}
+    extra = {"near": near_of(cameras), ADOPTED: source}
     if survey.antialiased:
         extra[ANTIALIASED] = True
     return SceneHeader(survey.quantizer(), times, options.rate, cameras, extra=extra)

@@ -34,6 +34,8 @@ FLAG_NAMES = ("kept", "changed")
 """Names of the tracks' planes of flags."""
 COMPRESSION = "compression"
 """Name of what `extra` says of a scene whose codes are coarser than those of the lossless one that it was made from"""
+ADOPTED = "adopted"
+"""Name of what `extra` says of a scene that was made of splat files"""
 LIGHT_STEPS = 100_000
 """Light is stored in steps of 1 / LIGHT_STEPS, a thousandth of a percent"""
 
@@ -105,6 +107,11 @@ class SceneHeader:
     def near(self) -> float:
         """Depth before which nothing is drawn, world; raises ValueError where the scene does not say."""
         return float(field_of(self.extra, "near", "the scene's header: extra"))
+
+    @property
+    def filmed(self) -> bool:
+        """Whether its cameras filmed it: splat files come without any, and get some to be looked at from."""
+        return bool(self.cameras) and ADOPTED not in self.extra
 
     @property
     def up(self) -> tuple[float, float, float] | None:

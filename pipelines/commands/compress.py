@@ -27,6 +27,8 @@ def command(arguments: argparse.Namespace) -> int:
     from packuv.compress import Goal
 
     check_place(arguments.output)
+    if arguments.capture:
+        _check_filmed(arguments.scene)
     filmed = _scores(arguments, arguments.scene) if arguments.capture else None
     fitted = {"fitted_db": filmed["psnr_db"]} if filmed else {}
     if arguments.fitted_db is not None:
@@ -46,6 +48,7 @@ def command(arguments: argparse.Namespace) -> int:
         "position_steps": (found.steps.position * found.steps.multiple).tolist(),
         "attribute_steps": found.steps.attribute.tolist(),
         "rows": found.rows,
+        "imagined": found.imagined,
     }
     if filmed:
         facts["filmed"] = {"lossless": filmed, "compressed": scores}
@@ -89,6 +92,16 @@ def _search(
     )
 
 
+def _check_filmed(path: Path) -> None:
+    from packuv.scene import open_scene
+
+    with open_scene(path) as scene:
+        if not scene.header.filmed:
+            raise ValueError(
+                f"a capture scores scenes that its cameras filmed, but no camera filmed {path}; leave out --capture"
+            )
+
+
 def _scores(arguments: argparse.Namespace, scene: Path) -> dict[str, float]:
     """PSNR and SSIM against what was filmed, renders being as the cameras would film them."""
     from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
@@ -101,12 +114,14 @@ def _scores(arguments: argparse.Namespace, scene: Path) -> dict[str, float]:
 def _text(facts: Mapping[str, Any]) -> str:
     unseen = facts["psnr_held_out_db"]
     held_out = "" if unseen is None else f", {unseen:.2f} dB of cameras that no step was learned from"
-    source = {"capture": "measured", "given": "given", "assumed": "assumed; --capture measures it"}
+    views = ", from views that were imagined, for no camera filmed it" if facts["imagined"] else ""
+    assumed = "assumed; there is none" if facts["imagined"] else "assumed; --capture measures it"
+    source = {"capture": "measured", "given": "given", "assumed": assumed}
     lines = [
         f"{facts['file']}: {size_text(facts['bytes'])}, {facts['ratio']:.2f} times smaller than the lossless "
         f"{size_text(facts['source_bytes'])}",
         f"gaussians  {facts['rows']:.1%} are still there; the others were hardly seen",
-        f"pictures   {facts['psnr_db']:.2f} dB to those of the lossless scene{held_out}",
+        f"pictures   {facts['psnr_db']:.2f} dB to those of the lossless scene{held_out}{views}",
         f"loss       {facts['loss_db']:.3f} dB of {facts['fitted_db']:.2f} dB against footage "
         f"({source[facts['fitted_db_from']]}), by these pictures",
     ]

@@ -84,7 +84,7 @@ def info(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _compression(extra: Mapping[str, Any], size: int) -> dict[str, float] | None:
+def _compression(extra: Mapping[str, Any], size: int) -> dict[str, Any] | None:
     """What a compressed scene says of itself; None for one that is as it was fitted."""
     from packuv.bounds import field, fields, finite
     from packuv.scene.header import COMPRESSION
@@ -95,7 +95,7 @@ def _compression(extra: Mapping[str, Any], size: int) -> dict[str, float] | None
     said = fields(extra[COMPRESSION], what)
     names = ("source_bytes", "psnr_db", "loss_db", "fitted_db")
     known = {name: finite(field(said, name, what), f"{what}: {name}") for name in names}
-    return {**known, "ratio": known["source_bytes"] / size}
+    return {**known, "ratio": known["source_bytes"] / size, "imagined": "imagined" in said}
 
 
 def _light_range(light: np.ndarray) -> list[float] | None:
@@ -112,10 +112,11 @@ def _info_text(facts: Mapping[str, Any]) -> str:
     sounds = ["sound      {codec}, {seconds:.2f} s, of {camera}".format(**facts["sound"])] if facts["sound"] else []
     exact = "exactly as fitted" if facts["lossless"] else within.format(**facts["tolerance"])
     if made := facts["compression"]:
+        views = " from imagined views" if made["imagined"] else ""
         exact = (
-            "lossy, {ratio:.2f} times smaller than the lossless scene; pictures {psnr_db:.2f} dB to its, a loss of "
-            "{loss_db:.3f} dB where it has {fitted_db:.2f} dB against footage"
-        ).format(**made)
+            "lossy, {ratio:.2f} times smaller than the lossless scene; pictures {psnr_db:.2f} dB to its{views}, a loss "
+            "of {loss_db:.3f} dB where it has {fitted_db:.2f} dB against footage"
+        ).format(**made, views=views)
     return "\n".join(
         [
             f"{facts['file']}: {size_text(facts['bytes'])}, {size_text(facts['bytes_per_frame'])} a frame",

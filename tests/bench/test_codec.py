@@ -18,7 +18,7 @@ from packuv.gaussians.floats import with_canonical_axes
 from packuv.gaussians.segment import Segment
 from packuv.interchange import WRITTEN, SplatFormat
 from packuv.scene import SceneHeader, open_scene, write_scene
-from tests.support.needs import needs
+from tests.support.needs import needs, needs_ffmpeg
 from tests.support.small_scene import FRAMES, small_scene
 from tests.support.splats import random_gaussians
 
@@ -107,6 +107,23 @@ def test_a_codec_that_loses_is_not_said_to_be_exact(scene, monkeypatch):
     assert [row["layout"] for row in rows] == ["pictures, hevc", "codes, hevc"]
     assert not any(row["exact"] for row in rows)
     assert table(rows).count("NOT EXACT") == 2
+
+
+def test_pictures_alone_come_back_from_webp(scene):
+    (row,) = codec.measure_codecs(scene, ["webp"])
+    assert (row["layout"], row["exact"], row["frames"]) == ("pictures, webp", True, FRAMES)
+
+
+@needs_ffmpeg
+def test_pictures_alone_come_back_from_jpeg_xl_where_ffmpeg_has_it(scene):
+    (row,) = codec.measure_codecs(scene, ["jxl"])
+    assert row.get("exact") or "libjxl" in row["skipped"]
+
+
+def test_no_program_is_told(scene, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    (row,) = codec.measure_codecs(scene, ["jxl"])
+    assert "ffmpeg" in row["skipped"]
 
 
 def test_formats_that_are_measured_are_read_and_written():

@@ -139,7 +139,7 @@ def test_tuning_makes_up_for_who_is_left_out_and_leaves_others_alone(cameras):
 
 def test_keys_of_equal_rows_stay_equal_when_they_are_tuned(cameras, tmp_path):
     with open_scene(small_scene(tmp_path / "scene.mkv")) as scene:
-        rows = Rows(scene, Views(cameras), tmp_path, seed=0, ticks=ticks())
+        rows = Rows(scene, Views(cameras), tmp_path, near=NEAR, seed=0, ticks=ticks())
         first, second = (Segment.load(path) for path in rows.coarse(1e-7, COARSE, 10))
     assert 0 < rows.kept < rows.count == 2 * ROWS
     where = {row.tobytes() for row in np.hstack([first.key.xyz, first.key.attributes.astype(np.uint16)])}

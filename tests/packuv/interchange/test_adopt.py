@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Codes
 from packuv.gaussians.floats import rows_of
+from packuv.gaussians.orbit import OrbitOptions, middle, near_of, orbit
 from packuv.gaussians.rows import first_appearance
 from packuv.gaussians.uvsize import UvOptions
 from packuv.interchange import write_ply, write_spz
 from packuv.interchange.adopt import AdoptOptions, adopt, find_frames, read_frame
 from packuv.interchange.joined import GROWTH, equal_codes, segments_of
-from packuv.interchange.orbit import OrbitOptions, likeness, middle, near_of, orbit
+from packuv.interchange.likeness import likeness
 from packuv.scene import open_scene, verify_scene
 from tests.support.splats import random_gaussians
 
@@ -224,6 +225,9 @@ def test_orbit_cameras_look_at_the_middle_from_outside_and_above():
         assert camera.camera_from_world[1, 1] > 0  # and down in the picture is +y
         assert np.isclose(np.linalg.det(camera.camera_from_world[:3, :3]), 1)
     assert len({tuple(camera.centre.round(6)) for camera in cameras}) == 5
+    alone = rows_of(gaussians, slice(5, 6))
+    _, radius = middle(alone, share=0.9)
+    assert np.isclose(radius, 3 * np.exp(alone.log_scales.max()))  # a point has no extent, but is seen from outside
     near = near_of(cameras)
     assert np.isinf(likeness(gaussians, gaussians, cameras[:1], near=near)).all()
     fewer = rows_of(gaussians, slice(0, 500))

@@ -8,10 +8,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from packuv.gaussians.floats import SH_C0, rows_of
+from packuv.gaussians.orbit import OrbitOptions
 from packuv.interchange import antialiased, read_gaussians, read_spz, write_ply, write_spz
 from packuv.interchange.adopt import ANTIALIASED, AdoptOptions, adopt
 from packuv.interchange.conventions import finite
-from packuv.interchange.orbit import OrbitOptions
 from packuv.interchange.spz import COARSE
 from packuv.scene import open_scene, verify_scene
 from tests.support.splats import FIELDS, alpha_of, ksplat_bytes, random_gaussians, rotation_error, splat_bytes

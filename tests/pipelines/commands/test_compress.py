@@ -6,6 +6,8 @@ import json
 
 import pytest
 
+from packuv.interchange import write_ply
+from packuv.interchange.adopt import AdoptOptions, adopt
 from packuv.scene import open_scene
 from pipelines.cli import main
 from pipelines.commands import compress
@@ -73,3 +75,35 @@ def test_the_loss_that_footage_shows_is_what_was_asked_for_at_most(
     else:
         filmed = json.loads(said.out)["filmed"]
         assert 0.4 < filmed["lossless"]["psnr_db"] - filmed["compressed"]["psnr_db"] <= 0.5
+
+
+@pytest.fixture(scope="module")
+def splats(tmp_path_factory):
+    """A scene of a splat file, which no camera filmed."""
+    folder = tmp_path_factory.mktemp("splats")
+    with open_scene(small_scene(folder / "filmed.mkv")) as scene:
+        write_ply(folder / "a.ply", scene.gaussians(0))
+    adopt([folder / "a.ply"], folder / "a.mkv", options=AdoptOptions(compared_frames=0))
+    return folder / "a.mkv"
+
+
+def test_who_compresses_what_nobody_filmed_is_told_so(splats, tmp_path, capsys):
+    small = tmp_path / "small.mkv"
+    assert main(["compress", str(splats), "--loss-db", "1", "--iterations", "0", "-o", str(small)]) == 0
+    said = capsys.readouterr().out
+    assert "from views that were imagined, for no camera filmed it" in said
+    assert "of 30.00 dB against footage (assumed; there is none)" in said
+    assert main(["info", str(small)]) == 0
+    assert "dB to its from imagined views" in capsys.readouterr().out
+    with open_scene(small) as scene:
+        assert "imagined" in scene.header.extra["compression"]
+        assert [camera.name for camera in scene.header.cameras] == [f"orbit{number:02d}" for number in range(6)]
+
+
+def test_no_capture_scores_what_nobody_filmed(splats, tmp_path, capsys):
+    words = ["--loss-db", "1", "--capture", str(tmp_path), "-o", str(tmp_path / "small.mkv")]
+    assert main(["compress", str(splats), *words]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "no camera filmed" in said
+    assert not list(tmp_path.iterdir())
