@@ -50,8 +50,3 @@ class Activity:
             shares=self.shares[kept],
             flow=self.flow[kept],
         )
-
-    def later(self, by: int) -> Activity:
-        """The same at instants that are so many later; what comes in is not there."""
-        rows = np.arange(len(self.there)) - by
-        return self.at(np.where((rows >= 0) & (rows < len(rows)), rows, -1)) if by else self

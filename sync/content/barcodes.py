@@ -28,24 +28,52 @@ LEAST_SHARE = 1e-3
 NEIGHBOURS = 10
 """Each camera is compared with so many of the nearest ones"""
 
-Agreements = dict[tuple[int, int], np.ndarray]
+Pair = tuple[int, int]
+Agreements = dict[Pair, np.ndarray]
 """By pair of cameras what `agreement` says of them"""
 Signals = tuple[np.ndarray, np.ndarray]
-"""Of two cameras over time, float64 [T, n] each"""
+"""Of two cameras over time, float [T, n] each"""
 
 
-def compare_pairs(seen: Sequence[Activity], reach: int) -> list[Agreements]:
-    """Of cameras that are among each other's nearest by what moves on common lines, and by how fast it crosses them.
+class SharedLines:
+    """What pairs of cameras tell over time, and how well that agrees wherever the cameras are moved in time.
 
-    Of all by how much moves in their pictures, where it is not known how one stands.
+    Of cameras that are among each other's nearest, whether anything moves on common lines, and how fast it crosses
+    them. Of all, how much moves in their pictures, where it is not known how one stands.
     """
-    posed = all(one.posed for one in seen)
-    kinds: list[Agreements] = [{}, {}] if posed else [{}]
-    for first, second in _pairs(seen):
-        a, b = seen[first], seen[second]
-        for kind, signals in zip(kinds, _on_lines(a, b) if posed else [(_course(a), _course(b))], strict=False):
-            kind[first, second] = agreement(*signals, a.there, b.there, reach)
-    return kinds
+
+    def __init__(self, seen: Sequence[Activity], reach: int) -> None:
+        self._there, self._reach = [one.there for one in seen], reach
+        posed = all(one.posed for one in seen)
+        self._kinds: list[dict[Pair, Signals]] = [{}, {}] if posed else [{}]
+        for first, second in _pairs(seen):
+            a, b = seen[first], seen[second]
+            for kind, (one, other) in zip(self._kinds, _on_lines(a, b) if posed else [_courses(a, b)], strict=False):
+                kind[first, second] = one.astype(np.float32), other.astype(np.float32)
+        self._known: dict[tuple[int, ...], np.ndarray] = {}
+
+    def agreements(self, places: np.ndarray) -> list[Agreements]:
+        """Of each kind of signal if the cameras' pictures were so many instants later, int [C]."""
+        return [
+            {pair: self._agreement(number, pair, places) for pair in kind} for number, kind in enumerate(self._kinds)
+        ]
+
+    def _agreement(self, kind: int, pair: Pair, places: np.ndarray) -> np.ndarray:
+        moved = [int(places[camera]) for camera in pair]
+        at = (kind, *pair, *moved)
+        if at not in self._known:
+            a, b = (_later(signal, by) for signal, by in zip(self._kinds[kind][pair], moved, strict=True))
+            there_a, there_b = (_later(self._there[camera], by) for camera, by in zip(pair, moved, strict=True))
+            self._known[at] = agreement(a, b, there_a, there_b, self._reach)
+        return self._known[at]
+
+
+def _later(rows: np.ndarray, by: int) -> np.ndarray:
+    """Rows moved down by so many; 0 comes in."""
+    moved = np.zeros_like(rows)
+    if abs(by) < len(rows):
+        moved[max(0, by) : len(rows) + min(0, by)] = rows[max(0, -by) : len(rows) - max(0, by)]
+    return moved
 
 
 def _pairs(seen: Sequence[Activity]) -> Iterator[tuple[int, int]]:
@@ -83,6 +111,10 @@ def _on_lines(first: Activity, second: Activity) -> list[Signals]:
     return list(zip(*told, strict=True))
 
 
+def _courses(first: Activity, second: Activity) -> Signals:
+    return _course(first), _course(second)
+
+
 def _course(seen: Activity) -> np.ndarray:
     """By what factor the share of the picture that moves changes, as a logarithm: float64 [T, 1]."""
     moved = np.bincount(seen.instants, seen.shares, minlength=len(seen.there)) / seen.count
@@ -94,16 +126,18 @@ def _told_by(seen: Activity, line: np.ndarray, count: int, planes: np.ndarray) -
     """Whether anything moves on each line, and the root, with its sign, of the mean rate of it, so that one throw does
     not drown all else. Cells near the axis, which turn by much for a small error, count little."""
     assert seen.rays is not None
-    lines = line[seen.cells]
-    known = lines >= 0
-    places, shares = seen.instants[known] * count + lines[known], seen.shares[known]
-    steps = np.stack([seen.rays[1], seen.rays[seen.width]]) - seen.rays[0]  # to the next cell across and down
-    rays, motion = seen.rays[seen.cells[known]] @ planes, seen.flow[known] @ steps @ planes
-    turned = rays[:, 1] * motion[:, 0] - rays[:, 0] * motion[:, 1]
-    moved, turning, inertia = (
-        np.bincount(places, weights, minlength=len(seen.there) * count).reshape(-1, count)
-        for weights in (shares, shares * turned, shares * np.square(rays).sum(axis=1))
+    across, down = ((seen.rays[cell] - seen.rays[0]) @ planes for cell in (1, seen.width))  # to the next cell
+    rays = seen.rays @ planes
+    turning = np.stack([rays[:, 1] * step[0] - rays[:, 0] * step[1] for step in (across, down)], axis=1)  # by its flow
+    inertia = np.square(rays).sum(axis=1)
+    places = seen.instants * (count + 1) + line[seen.cells] + 1  # 0 of an instant: on no line
+    turned = np.einsum("nk,nk->n", turning.astype(np.float32)[seen.cells], seen.flow)
+    moved, turned, weight = (
+        np.bincount(places, seen.shares * values, minlength=len(seen.there) * (count + 1))
+        .reshape(-1, count + 1)[:, 1:]
+        .astype(np.float64)
+        for values in (np.float32(1), turned, inertia.astype(np.float32)[seen.cells])
     )
-    rates = turning / np.where(inertia > 0, inertia, 1)
+    rates = turned / np.where(weight > 0, weight, 1)
     known_by = np.minimum(1, moved / MOVING_CELLS)
     return (moved > MOVING_CELLS).astype(np.float64), np.sign(rates) * np.sqrt(np.abs(rates)) * known_by

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from sync.content.activity import Activity
 from sync.content.agreement import BLOCKS, LEAST_OVERLAP
-from sync.content.barcodes import Agreements, compare_pairs
+from sync.content.barcodes import Agreements, SharedLines
 
 APART = 2 / 3
 """Offset in instants from which a camera is said to be off: a whole frame, less what is measured too little"""
@@ -147,17 +147,17 @@ def find_offsets(
     reach = min(reach, int(instants * (1 - LEAST_OVERLAP)))
     if reach < 1:
         return {}
-    places = np.zeros(len(names), np.int64)
+    lines, places = SharedLines(cameras, reach), np.zeros(len(names), np.int64)
     if not paired:
-        *_, pairs = compare_pairs(cameras, reach)
+        *_, pairs = lines.agreements(places)
         if not pairs:
             return {}
         places = _settle(pairs, _grown(pairs, len(names), reach), reach)
-    found = _measure(cameras, places, reach)
+    found = _measure(lines, places, reach, range(len(names)))
     for _ in range(len(names)):
         if not any(own.lies for own in found.values()):
             break
-        moved, measured = _best_move(cameras, places, found, reach)
+        moved, measured = _best_move(lines, places, found, reach)
         if _strain(measured) >= _strain(found):
             break
         places, found = moved, measured
@@ -168,8 +168,7 @@ def find_offsets(
     told = _with_errors_of(told, _scatter(told) * np.array([own.error for own in told.values()]))
     sure = [camera for camera, own in told.items() if own.decided]
     if len(sure) < len(told) and any(own.lies for own in told.values()):
-        again = _measure([cameras[camera] for camera in sure], places[sure], reach)
-        still = _told({sure[row]: own for row, own in again.items()}, places - usual, said)
+        still = _told(_measure(lines, places, reach, sure), places - usual, said)
         still = {camera: replace(own, error=told[camera].error) for camera, own in still.items()}
         told |= {camera: _doubted(own) for camera, own in told.items() if own.lies and not _lies_in(still, camera)}
     return {names[camera]: own for camera, own in told.items()}
@@ -218,7 +217,7 @@ def _told(found: Mapping[int, Offset], moved: np.ndarray, said: Sequence[float])
 
 
 def _best_move(
-    cameras: Sequence[Activity], places: np.ndarray, found: Mapping[int, Offset], reach: int
+    lines: SharedLines, places: np.ndarray, found: Mapping[int, Offset], reach: int
 ) -> tuple[np.ndarray, dict[int, Offset]]:
     """Places with one camera moved to where it seems to belong, and what is measured there. A camera that lies draws
     others along: of those that seem most wrong the one is moved after which all fit best, or well enough."""
@@ -227,7 +226,7 @@ def _best_move(
     for camera in wrong[:SUSPECTS]:
         moved, away = places.copy(), found[camera].instants
         moved[camera] += round(away) or int(np.sign(away))
-        tried.append((moved, _measure(cameras, moved, reach)))
+        tried.append((moved, _measure(lines, moved, reach, range(len(places)))))
         if _strain(tried[-1][1]) <= len(found):
             break
     return min(tried, key=lambda one: _strain(one[1]))
@@ -238,13 +237,16 @@ def _strain(found: Mapping[int, Offset]) -> float:
     return sum((own.away / own.error) ** 2 for own in found.values())
 
 
-def _measure(cameras: Sequence[Activity], places: np.ndarray, reach: int) -> dict[int, Offset]:
-    """Offsets that are left once each camera is moved to its place; those that no motion tells are missing."""
-    moved = [one.later(int(place)) for one, place in zip(cameras, places, strict=True)]
-    agreements, still = compare_pairs(moved, reach), np.zeros(len(cameras), np.int64)
-    found = {}
-    for camera in range(len(cameras)):
-        kinds = [against_others(pairs, camera, still, reach) for pairs in agreements]
+def _measure(lines: SharedLines, places: np.ndarray, reach: int, among: Collection[int]) -> dict[int, Offset]:
+    """Offsets of some cameras against each other that are left once each is moved to its place; those that no motion
+    tells are missing."""
+    shared = [
+        {pair: levels for pair, levels in agreements.items() if set(pair) <= set(among)}
+        for agreements in lines.agreements(places)
+    ]
+    still, found = np.zeros(len(places), np.int64), {}
+    for camera in among:
+        kinds = [against_others(agreements, camera, still, reach) for agreements in shared]
         told = [(parts.sum(axis=0), _locate(parts, reach)) for parts in kinds if len(parts)]
         if told:
             found[camera] = _combined(told, reach)
