@@ -31,8 +31,6 @@ CLEAR = 1.75
 LEAST_ERROR = 0.02
 LEAST_REACH = 3
 """Instants that must be tried to either side for an offset of one to have two beside it"""
-SUSPECTS = 4
-"""Cameras of which each is tried as the one that lies"""
 
 
 @dataclass(frozen=True)
@@ -133,9 +131,9 @@ def find_offsets(
     """Offset of each camera against the others, up to `reach` instants either way; cameras that share no motion with
     another are missing.
 
-    Most cameras are taken to be right: their median is 0. While any camera lies, the one is moved after
-    which all fit best. Of cameras whose places nobody knows, how much moves in the whole picture is compared, which
-    tells less.
+    Most cameras are taken to be right: their median is 0. While any camera agrees better with the others elsewhere, the
+    one that gains most is moved there, for who lies draws others along. Of cameras whose places nobody knows, how much
+    moves in the whole picture is compared, which tells less.
 
     Args:
         seen: by camera, all of the same T instants.
@@ -147,20 +145,13 @@ def find_offsets(
     reach = min(reach, int(instants * (1 - LEAST_OVERLAP)))
     if reach < 1:
         return {}
-    lines, places = SharedLines(cameras, reach), np.zeros(len(names), np.int64)
-    if not paired:
-        *_, pairs = lines.agreements(places)
-        if not pairs:
-            return {}
-        places = _settle(pairs, _grown(pairs, len(names), reach), reach)
+    lines = SharedLines(cameras, reach)
+    *_, pairs = lines.agreements(np.zeros(len(names), np.int64))
+    if not pairs:
+        return {}
+    start = np.zeros(len(names), np.int64) if paired else _grown(pairs, len(names), reach)
+    places = _settle(pairs, start, reach, CLEAR if paired else 0.0)
     found = _measure(lines, places, reach, range(len(names)))
-    for _ in range(len(names)):
-        if not any(own.lies for own in found.values()):
-            break
-        moved, measured = _best_move(lines, places, found, reach)
-        if _strain(measured) >= _strain(found):
-            break
-        places, found = moved, measured
     usual = _usual([own.instants + places[camera] for camera, own in found.items()])
     said = [(expected or {}).get(name, 0.0) for name in names]
     told = _told(found, places - usual, said)
@@ -216,27 +207,6 @@ def _told(found: Mapping[int, Offset], moved: np.ndarray, said: Sequence[float])
     }
 
 
-def _best_move(
-    lines: SharedLines, places: np.ndarray, found: Mapping[int, Offset], reach: int
-) -> tuple[np.ndarray, dict[int, Offset]]:
-    """Places with one camera moved to where it seems to belong, and what is measured there. A camera that lies draws
-    others along: of those that seem most wrong the one is moved after which all fit best, or well enough."""
-    tried = []
-    wrong = sorted(found, key=lambda camera: -abs(found[camera].away) / found[camera].error)
-    for camera in wrong[:SUSPECTS]:
-        moved, away = places.copy(), found[camera].instants
-        moved[camera] += round(away) or int(np.sign(away))
-        tried.append((moved, _measure(lines, moved, reach, range(len(places)))))
-        if _strain(tried[-1][1]) <= len(found):
-            break
-    return min(tried, key=lambda one: _strain(one[1]))
-
-
-def _strain(found: Mapping[int, Offset]) -> float:
-    """How badly places fit what is measured at them."""
-    return sum((own.away / own.error) ** 2 for own in found.values())
-
-
 def _measure(lines: SharedLines, places: np.ndarray, reach: int, among: Collection[int]) -> dict[int, Offset]:
     """Offsets of some cameras against each other that are left once each is moved to its place; those that no motion
     tells are missing."""
@@ -272,21 +242,27 @@ def _grown(agreements: Agreements, count: int, reach: int) -> np.ndarray:
     return places
 
 
-def _settle(agreements: Agreements, start: np.ndarray, reach: int) -> np.ndarray:
+def _settle(agreements: Agreements, start: np.ndarray, reach: int, least: float) -> np.ndarray:
     """Whole offsets int64 [count] at which the cameras agree best: from a start, the one that gains most moves, until
-    none gains by moving."""
+    none gains by moving, by more than `least` standard errors."""
     places, count = start.copy(), len(start)
     for _ in range(4 * count):
         gains, goals = np.zeros(count), places.copy()
         for camera in range(count):
-            levels = against_others(agreements, camera, places, reach).sum(axis=(0, 2))
+            levels = against_others(agreements, camera, places, reach).sum(axis=0)
             if levels.any():
-                goals[camera] = int(levels.argmax()) - reach
-                gains[camera] = levels.max() - levels[places[camera] + reach]
+                goals[camera] = int(levels.sum(axis=1).argmax()) - reach
+                gain = levels[goals[camera] + reach] - levels[places[camera] + reach]
+                gains[camera] = gain.sum() if _sigmas(gain[None]) > least else 0.0
         if gains.max() <= 0:
             break
         places[gains.argmax()] = goals[gains.argmax()]
     return places
+
+
+def _sigmas(parts: np.ndarray) -> float:
+    """By how many standard errors the least of sums of [n, BLOCKS] differs from 0."""
+    return float((parts.sum(axis=1) / np.maximum(np.sqrt(BLOCKS) * parts.std(axis=1, ddof=1), 1e-12)).min())
 
 
 def against_others(agreements: Agreements, camera: int, places: np.ndarray, reach: int) -> np.ndarray:
@@ -337,8 +313,7 @@ def _clearness(levels: np.ndarray, top: int) -> float:
     """By how many standard errors [n, BLOCKS] is larger at a row than two rows above and below; 0 at the edge."""
     if not 2 <= top < len(levels) - 2:
         return 0.0
-    gains = levels[top] - levels[[top - 2, top + 2]]
-    return float((gains.sum(axis=1) / np.maximum(np.sqrt(BLOCKS) * gains.std(axis=1, ddof=1), 1e-12)).min())
+    return _sigmas(levels[top] - levels[[top - 2, top + 2]])
 
 
 def _peak(levels: np.ndarray) -> float:
