@@ -42,10 +42,10 @@ def agreement(
     return found
 
 
-def _centred(barcode: np.ndarray, there: np.ndarray) -> np.ndarray:
+def _centred(signal: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Less the mean of each line over a while, 0 at instants without a picture."""
-    known = np.where(there[:, None], barcode, 0.0).astype(np.float64)
-    sums = np.concatenate([np.zeros((1, barcode.shape[1] + 1)), np.cumsum(np.column_stack([known, there]), axis=0)])
+    known = np.where(there[:, None], signal, 0.0).astype(np.float64)
+    sums = np.concatenate([np.zeros((1, signal.shape[1] + 1)), np.cumsum(np.column_stack([known, there]), axis=0)])
     middle = np.arange(len(there))
     first, stop = np.maximum(middle - WHILE // 2, 0), np.minimum(middle + WHILE // 2 + 1, len(there))
     around = sums[stop] - sums[first]

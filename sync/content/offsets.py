@@ -9,7 +9,7 @@ import numpy as np
 
 from sync.content.activity import Activity
 from sync.content.agreement import BLOCKS, LEAST_OVERLAP
-from sync.content.barcodes import Agreements, SharedLines
+from sync.content.lines import Agreements, SharedLines
 
 APART = 2 / 3
 """Offset in instants from which a camera is said to be off: a whole frame, less what is measured too little"""

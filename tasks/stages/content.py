@@ -143,6 +143,7 @@ def _changed(
         return shares, np.zeros((len(shares), 2), np.float32)
     vectors = cache.optical_flow(column, instant)
     assert vectors is not None, "there is a step to this instant"
+    vectors = np.nan_to_num(vectors, posinf=0, neginf=0)
     weights = cv2.resize(mask, vectors.shape[1::-1], interpolation=cv2.INTER_AREA)[..., None]
     both = cv2.resize(np.dstack([vectors * weights, weights]), size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
     return shares, both[:, :2] / np.maximum(both[:, 2:], LEAST_SHARE)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -84,6 +86,51 @@ def _first(own: Activity, instants: int) -> Activity:
 def test_several_cameras_may_be_off_by_frames_of_their_own():
     offsets = find_offsets(rig(7, {1: 2, 4: -3}), REACH)
     assert {name: round(offset.away) for name, offset in offsets.items() if offset.lies} == {"cam1": 2, "cam4": -3}
+
+
+@pytest.mark.parametrize("liars", [(0, 1), (2, 5), (1, 4)])
+def test_two_of_six_that_lie_alike_are_named(liars):
+    offsets = find_offsets(rig(6, dict.fromkeys(liars, 3.0)), REACH)
+    assert {name: round(own.away) for name, own in offsets.items() if own.lies} == {f"cam{one}": 3 for one in liars}
+
+
+@pytest.mark.parametrize("late", [-3, 1, 4])
+def test_where_everything_moves_at_all_times_its_speed_tells(late):
+    times = np.arange(80, dtype=float)
+    seen = {f"cam{number}": drifting(number, 5, times + late * (number == 2)) for number in range(5)}
+    for name, offset in find_offsets(seen, REACH).items():
+        assert offset.instants == pytest.approx(late if name == "cam2" else 0, abs=0.1)
+        assert offset.lies == (name == "cam2")
+    still = {name: replace(own, flow=0 * own.flow) for name, own in seen.items()}
+    assert not any(offset.decided for offset in find_offsets(still, REACH).values())
+
+
+def drifting(number: int, count: int, times: np.ndarray) -> Activity:
+    """A cloud as deep as the middle, which fills the picture and goes to and fro."""
+    turn, centre = camera_pose(number, count)
+    pixels = pixels_of()
+    rates, phases = np.random.default_rng(9).uniform(0.2, 0.9, (2, 3, 4))
+    steps = 0.02 * np.sin(rates * times[:, None, None] + 9 * phases).sum(axis=2)  # [T, 3]
+    depth = np.linalg.norm(centre) / pixels[2, 0]
+    x, y, z = depth * pixels[:, None, :] + (turn @ steps.T)[:, :, None]  # [T, P] each
+    flow = np.stack([pixels[2, 0] * x / z - pixels[0], pixels[2, 0] * y / z - pixels[1]], axis=-1)
+    moving = np.ones(flow.shape[:2], np.float32)
+    return _activity(moving, flow, np.ones(len(times), bool), centre, (turn.T @ pixels).T)
+
+
+def test_instants_are_chosen_as_from_a_table():
+    own = rig(3)["cam1"]
+    rows = np.array([5, -1, 5, 0, 119, 3])
+    found, whole = own.at(rows), _table(own)
+    assert np.array_equal(_table(found), np.where(rows[:, None] >= 0, whole[rows], 0))
+    assert np.array_equal(found.there, np.where(rows >= 0, own.there[rows], False))
+    assert np.array_equal(_table(own.at(np.arange(INSTANTS))), whole)
+
+
+def _table(own: Activity) -> np.ndarray:
+    table = np.zeros((len(own.there), own.count))
+    table[own.instants, own.cells] = own.shares
+    return table
 
 
 @pytest.mark.parametrize("late", [-0.4, 0.3, 0.5])

@@ -18,7 +18,7 @@ from sync.content.activity import Activity
 from sync.content.agreement import agreement
 
 LINES = 64
-"""Lines of a barcode, about"""
+"""That two cameras share, about"""
 ANGLES = 720
 """Steps of the full turn in which the angles that two cameras share are found"""
 MOVING_CELLS = 1.5
@@ -76,7 +76,7 @@ def _later(rows: np.ndarray, by: int) -> np.ndarray:
     return moved
 
 
-def _pairs(seen: Sequence[Activity]) -> Iterator[tuple[int, int]]:
+def _pairs(seen: Sequence[Activity]) -> Iterator[Pair]:
     if not all(one.posed for one in seen):
         yield from combinations(range(len(seen)), 2)
         return
