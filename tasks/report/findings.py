@@ -172,12 +172,12 @@ def _content_findings(report: ReportInput) -> Iterator[Finding]:
 
 
 def _alike(content: Content) -> Iterator[Finding]:
-    """Cameras that lie equally: who is right, pictures cannot tell."""
+    """Cameras that lie equally, and one of two: who is right, pictures cannot tell."""
     told = {name: worst[1] for name in content.cameras if (worst := content.worst(name))}
     frames = {name: round(offset.away) for name, offset in told.items() if offset.lies}
     for number, count in Counter(frames.values()).items():
+        names = ", ".join(name for name, own in frames.items() if own == number)
         if count > 1:
-            names = ", ".join(name for name, own in frames.items() if own == number)
             yield Finding(
                 "sync",
                 f"{names} lie by about the same {number:+d} frames, {count} of {len(content.cameras)} cameras: "
@@ -186,6 +186,15 @@ def _alike(content: Content) -> Iterator[Finding]:
                 Severity.NOTE,
                 "See whether the cameras of either group have something in common, such as a recorder or a label set "
                 "by hand, before moving their times.",
+            )
+        elif len(told) == 2 and len(frames) == 1:
+            (other,) = told.keys() - frames.keys()
+            yield Finding(
+                "sync",
+                f"Of {names} and {other} the pictures tell that their times differ by {abs(number)} frames, and not "
+                "which of them is wrong.",
+                Severity.NOTE,
+                "See which of the two was set by hand or started late before moving its times.",
             )
 
 

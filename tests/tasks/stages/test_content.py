@@ -165,6 +165,14 @@ def test_cameras_that_lie_equally_are_told_to_be_a_group() -> None:
     assert "about the same" not in " ".join(found.text for found in findings(ReportInput("balls", content=apart)))
 
 
+def test_of_two_cameras_neither_is_said_to_be_right() -> None:
+    content = Content(NAMES[:2], (Window(0, 79, {"cam0": Offset(3.0, 0.1), "cam1": Offset(0.0, 0.1)}),))
+    texts = [found.text for found in findings(ReportInput("balls", content=content))]
+    assert any(
+        text.startswith("Of cam0 and cam1 the pictures tell that their times differ by 3 frames") for text in texts
+    )
+
+
 def test_cameras_without_times_are_synchronized_by_their_pictures(tmp_path: Path) -> None:
     site = Site(tmp_path / "store", tmp_path / "capture", 1)
     late = {0: 6.0, 1: 0.0, 2: 3.4, 3: 11.0, 4: 1.0}
