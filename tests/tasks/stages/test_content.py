@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from tasks.artefacts.store import Key
 from tasks.report.facts import ReportInput
 from tasks.report.findings import findings
 from tasks.stages.clock import FindStarts
-from tasks.stages.content import CompareContent, choose_windows, read_content
+from tasks.stages.content import OFFSETS, CompareContent, choose_windows, read_content
 from tasks.stages.footage import RIG, Take
 from tasks.stages.synchronize import Synchronize, read_starts, starts_of
 from tasks.stages.track import MOTION, FindMotion
@@ -107,16 +108,15 @@ def _made(stage: Synchronize | FindMotion | FindStarts | CompareContent, site: S
     )
 
 
-def compared(site: Site, folder: Path, groups: Key) -> Key:
-    """The check, with one camera whose motion nobody has measured."""
+def compared(site: Site, folder: Path, groups: Key, *, keep_flow: bool = False) -> Key:
+    """The check, with one camera whose motion nobody has measured, and flow of the others that is kept or is not."""
+    options = replace(MOTION_OPTIONS, keep_flow=keep_flow)
     rig = put(site, "rig", lambda out: calibrated().save(out / RIG))
     take = Take(groups=groups, rig=rig, cameras=NAMES[:-1])
-    motion = _made(FindMotion(take=take, options=MOTION_OPTIONS), site, folder / "motion")
+    motion = _made(FindMotion(take=take, options=options), site, folder / "motion")
     assert (site.path(motion) / MOTION).is_dir()
     return _made(
-        CompareContent(
-            take=take, unseen=NAMES[-1:], motion=motion, motion_options=MOTION_OPTIONS, options=ContentOptions()
-        ),
+        CompareContent(take=take, unseen=NAMES[-1:], motion=motion, motion_options=options, options=ContentOptions()),
         site,
         folder / "content",
     )
@@ -141,6 +141,17 @@ def test_a_camera_whose_timecodes_lie_is_named_and_its_cure_cures(tmp_path: Path
     again = read_content(site.path(compared(site, tmp_path / "again", groups)))
     assert not lies_in(again)
     assert "are added to its times, as time_offset_s" in (site.path(groups) / "sync.json").read_text()
+
+
+def test_flow_that_is_kept_tells_what_flow_that_is_measured_anew_tells(tmp_path: Path) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    film(site.capture, {})
+    write_times(site.capture, {2: -1})
+    groups = synchronized(site, tmp_path / "sync")
+    anew, kept = (
+        site.path(compared(site, tmp_path / str(keep), groups, keep_flow=keep)) / OFFSETS for keep in (False, True)
+    )
+    assert anew.read_bytes() == kept.read_bytes()
 
 
 def test_what_the_pictures_say_of_times_is_told(tmp_path: Path) -> None:
