@@ -79,6 +79,15 @@ def test_a_liar_among_few_draws_nobody_along(late):
         assert {name for name, offset in offsets.items() if offset.lies} <= {f"cam{number}"}
 
 
+@pytest.mark.parametrize("late", [-17, 14, 20])
+def test_who_is_farther_off_than_is_looked_for_is_neither_confirmed_nor_given_another_number(late):
+    for number in (0, 4):
+        seen = {name: _first(own, 50) for name, own in rig(6, {number: late}).items()}
+        offsets = find_offsets(seen, REACH)
+        assert not any(offset.lies for offset in offsets.values())
+        assert not offsets[f"cam{number}"].decided
+
+
 def _first(own: Activity, instants: int) -> Activity:
     return own.at(np.arange(instants))
 
