@@ -168,7 +168,9 @@ def find_offsets(
 
 def _scatter(told: Mapping[int, Offset]) -> float:
     """By what factor cameras that do not lie scatter more than their errors say: few instants and partners that see
-    the same things move tell too little of how sure an offset is."""
+    the same things move tell too little of how sure an offset is. Two cameras do not tell it, so the most is taken."""
+    if len(told) < 3:
+        return MOST_SCATTER
     squares = sorted((own.away / own.error) ** 2 for own in told.values() if not own.lies)
     mildest = squares[: int(np.ceil(MILDEST * len(squares)))]
     return float(np.clip(np.sqrt(np.mean(mildest) / MILDEST_MEAN), 1.0, MOST_SCATTER)) if mildest else 1.0
