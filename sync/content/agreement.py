@@ -26,20 +26,21 @@ def agreement(
         float64 [2 reach + 1, BLOCKS], from -reach on, in parts by instants that add up; 0 without any change.
     """
     a, b = _centred(first, there_first), _centred(second, there_second)
-    scale = np.sqrt((a * a).sum() * (b * b).sum())
-    products, count = a @ b.T, len(a)
-    found = np.zeros((2 * reach + 1, BLOCKS))
+    scale, count = np.sqrt((a * a).sum() * (b * b).sum()), len(a)
     if not scale:
-        return found
+        return np.zeros((2 * reach + 1, BLOCKS))
+    padded = np.zeros((count, count + 2 * reach))
+    padded[:, reach : reach + count] = a @ b.T
+    down, along = padded.strides
+    products = np.lib.stride_tricks.as_strided(padded, (count, 2 * reach + 1), (down + along, along))  # by offset
+    sums = np.concatenate([np.zeros((1, 2 * reach + 1)), np.cumsum(products, axis=0)])
+    edges = -(-np.arange(BLOCKS + 1) * count // BLOCKS)
+    overlap = np.correlate(there_second.astype(np.int64), there_first.astype(np.int64), "full")
+    overlap = overlap[count - 1 - reach : count + reach, None]
     both = there_first.sum() * there_second.sum() / count
-    for offset in range(-reach, reach + 1):
-        start = max(0, -offset)
-        along = products.diagonal(offset)
-        blocks = np.arange(start, start + len(along)) * BLOCKS // count
-        overlap = int((there_first[start : start + len(along)] & there_second[start + offset :][: len(along)]).sum())
-        if overlap >= LEAST_OVERLAP * both:
-            found[offset + reach] = np.bincount(blocks, along, minlength=BLOCKS) * (both / (scale * overlap))
-    return found
+    known = overlap >= max(1.0, LEAST_OVERLAP * both)
+    parts: np.ndarray = np.where(known, np.diff(sums[edges], axis=0).T * both / (scale * np.maximum(overlap, 1)), 0.0)
+    return parts
 
 
 def _centred(signal: np.ndarray, there: np.ndarray) -> np.ndarray:

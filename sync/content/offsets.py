@@ -142,10 +142,11 @@ def find_offsets(
     """
     names, cameras = tuple(seen), tuple(seen.values())
     instants = len(cameras[0].there) if cameras else 0
-    reach = min(reach, int(instants * (1 - LEAST_OVERLAP)))
+    farthest = int(instants * (1 - LEAST_OVERLAP))
+    reach = min(reach, farthest)
     if reach < 1:
         return {}
-    lines = SharedLines(cameras, reach)
+    lines = SharedLines(cameras, farthest)
     *_, pairs = lines.agreements(np.zeros(len(names), np.int64))
     if not pairs:
         return {}
@@ -167,7 +168,9 @@ def find_offsets(
 
 def _scatter(told: Mapping[int, Offset]) -> float:
     """By what factor cameras that do not lie scatter more than their errors say: few instants and partners that see
-    the same things move tell too little of how sure an offset is."""
+    the same things move tell too little of how sure an offset is. Two cameras do not tell it, so the most is taken."""
+    if len(told) < 3:
+        return MOST_SCATTER
     squares = sorted((own.away / own.error) ** 2 for own in told.values() if not own.lies)
     mildest = squares[: int(np.ceil(MILDEST * len(squares)))]
     return float(np.clip(np.sqrt(np.mean(mildest) / MILDEST_MEAN), 1.0, MOST_SCATTER)) if mildest else 1.0
@@ -216,8 +219,8 @@ def _measure(lines: SharedLines, places: np.ndarray, reach: int, among: Collecti
     ]
     still, found = np.zeros(len(places), np.int64), {}
     for camera in among:
-        kinds = [against_others(agreements, camera, still, reach) for agreements in shared]
-        told = [(parts.sum(axis=0), _locate(parts, reach)) for parts in kinds if len(parts)]
+        kinds = [against_others(agreements, camera, still) for agreements in shared]
+        told = [(parts.sum(axis=0), _locate(_within(parts, reach), reach)) for parts in kinds if len(parts)]
         if told:
             found[camera] = _combined(told, reach)
     return found
@@ -235,7 +238,7 @@ def _grown(agreements: Agreements, count: int, reach: int) -> np.ndarray:
         waiting = sorted({camera for pair in among for camera in pair} - placed)
         if not waiting:
             break  # the rest shares nothing with them
-        levels = {camera: against_others(among, camera, places, reach).sum(axis=(0, 2)) for camera in waiting}
+        levels = {camera: _within(against_others(among, camera, places), reach).sum(axis=(0, 2)) for camera in waiting}
         best = max(waiting, key=lambda camera: float(levels[camera].max(initial=-1.0)))
         places[best] = int(levels[best].argmax()) - reach
         placed.add(best)
@@ -249,7 +252,7 @@ def _settle(agreements: Agreements, start: np.ndarray, reach: int, least: float)
     for _ in range(4 * count):
         gains, goals = np.zeros(count), places.copy()
         for camera in range(count):
-            levels = against_others(agreements, camera, places, reach).sum(axis=0)
+            levels = _within(against_others(agreements, camera, places).sum(axis=0), reach)
             if levels.any():
                 goals[camera] = int(levels.sum(axis=1).argmax()) - reach
                 gain = levels[goals[camera] + reach] - levels[places[camera] + reach]
@@ -265,14 +268,20 @@ def _sigmas(parts: np.ndarray) -> float:
     return float((parts.sum(axis=1) / np.maximum(np.sqrt(BLOCKS) * parts.std(axis=1, ddof=1), 1e-12)).min())
 
 
-def against_others(agreements: Agreements, camera: int, places: np.ndarray, reach: int) -> np.ndarray:
-    """Agreement of a camera with each of the others where these are, by its own offset: [n, 2 reach + 1, BLOCKS]."""
-    found = []
+def against_others(agreements: Agreements, camera: int, places: np.ndarray) -> np.ndarray:
+    """Agreement of a camera with each of the others where these are, by its own offset: [n, 2 farthest + 1, BLOCKS]."""
+    found, offsets = [], max(map(len, agreements.values()), default=1)
     for (first, second), levels in agreements.items():
         if camera in (first, second) and levels.any():
             own, other = (levels, second) if camera == first else (levels[::-1], first)
             found.append(_shifted(own, int(places[other])))
-    return np.array(found).reshape(-1, 2 * reach + 1, BLOCKS)
+    return np.array(found).reshape(-1, offsets, BLOCKS)
+
+
+def _within(levels: np.ndarray, reach: int) -> np.ndarray:
+    """Of levels [..., 2 farthest + 1, BLOCKS] those up to an offset."""
+    middle = levels.shape[-2] // 2
+    return levels[..., middle - reach : middle + reach + 1, :]
 
 
 def _shifted(levels: np.ndarray, by: int) -> np.ndarray:
@@ -296,22 +305,24 @@ def _locate(own: np.ndarray, reach: int) -> Offset:
 
 
 def _combined(told: Sequence[tuple[np.ndarray, Offset]], reach: int) -> Offset:
-    """Mean of what kinds of signals tell, levels [2 reach + 1, BLOCKS] and offset each, by their errors; less sure the
-    more they disagree."""
+    """Mean of what kinds of signals tell, levels [2 farthest + 1, BLOCKS] and offset each, by their errors; less sure
+    the more they disagree."""
     weights = np.array([own.error**-2 for _, own in told])
     offsets = np.array([own.instants for _, own in told])
     mean = float(weights @ offsets / weights.sum())
     apart = float(weights @ (offsets - mean) ** 2) / max(1, len(told) - 1)
     error = float(np.sqrt(max(1.0, apart) / weights.sum()))
-    tops = [float(levels.sum(axis=1).max()) for levels, _ in told]
+    tops = [float(_within(levels, reach).sum(axis=1).max()) for levels, _ in told]
     heights = [top if top > 0 else np.inf for top in tops]  # what agrees nowhere tells nothing
     whole = sum(weight / height * levels for weight, height, (levels, _) in zip(weights, heights, told, strict=True))
-    return Offset(mean, error, clear=_clearness(whole, round(mean) + reach))
+    return Offset(mean, error, clear=_clearness(whole, round(mean)) if abs(round(mean)) <= reach - 2 else 0.0)
 
 
-def _clearness(levels: np.ndarray, top: int) -> float:
-    """By how many standard errors [n, BLOCKS] is larger at a row than two rows above and below; 0 at the edge."""
-    if not 2 <= top < len(levels) - 2:
+def _clearness(levels: np.ndarray, offset: int) -> float:
+    """By how many standard errors [2 farthest + 1, BLOCKS] is larger at an offset than at two more and two less; 0 if
+    it is largest anywhere else, maybe beyond what is looked for: of a few offsets one agrees best by chance, too."""
+    top = offset + len(levels) // 2
+    if abs(int(levels.sum(axis=1).argmax()) - top) > 1:
         return 0.0
     return _sigmas(levels[top] - levels[[top - 2, top + 2]])
 

@@ -34,7 +34,7 @@ LONGEST_STEP = 2
 class CompareContent(Stage):
     """Measure by what moves how far each camera's pictures lie from the others' at the same instants: offsets.json."""
 
-    name, version = "content", 7
+    name, version = "content", 8
     take: Take
     """Of the cameras whose motion is measured"""
     unseen: tuple[str, ...]

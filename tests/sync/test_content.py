@@ -9,7 +9,7 @@ import pytest
 
 from sync.content import Activity, Content, Offset, Window, find_offsets
 from sync.content.agreement import BLOCKS
-from sync.content.offsets import _combined
+from sync.content.offsets import MOST_SCATTER, _combined, _scatter
 from tests.support.balls import WIDTH, camera_pose, discs, pixels_of
 
 INSTANTS, REACH = 120, 8
@@ -77,6 +77,15 @@ def test_a_liar_among_few_draws_nobody_along(late):
         seen = {name: _first(own, 50) for name, own in rig(4, {number: late}).items()}
         offsets = find_offsets(seen, REACH)
         assert {name for name, offset in offsets.items() if offset.lies} <= {f"cam{number}"}
+
+
+@pytest.mark.parametrize("late", [-17, 14, 20])
+def test_who_is_farther_off_than_is_looked_for_is_neither_confirmed_nor_given_another_number(late):
+    for number in (0, 4):
+        seen = {name: _first(own, 50) for name, own in rig(6, {number: late}).items()}
+        offsets = find_offsets(seen, REACH)
+        assert not any(offset.lies for offset in offsets.values())
+        assert not offsets[f"cam{number}"].decided
 
 
 def _first(own: Activity, instants: int) -> Activity:
@@ -196,6 +205,15 @@ def test_pictures_that_agree_nowhere_tell_nothing():
         assert own.clear == 0
         assert own.by_chance
         assert np.isfinite([own.instants, own.error]).all()
+
+
+def test_two_cameras_do_not_tell_how_much_right_ones_scatter():
+    """One of them is the median; whether the other is off by chance only a third could tell."""
+    two = {0: Offset(0.0, 0.2), 1: Offset(0.3, 0.2)}
+    assert _scatter(two) == MOST_SCATTER
+    assert 1 < _scatter(two | {2: Offset(-0.2, 0.2)}) < MOST_SCATTER
+    seen = {name: own for name, own in rig(6, {1: 3}).items() if name in {"cam0", "cam1"}}
+    assert any(offset.lies for offset in find_offsets(seen, REACH).values())
 
 
 def test_a_whole_frame_that_is_not_sure_is_no_confirmation():
