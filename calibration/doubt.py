@@ -96,7 +96,7 @@ def doubts(
     chance |= {key for key, px in known.items() if px > options.gross * limit and key <= exact}
     known = {key: px for key, px in known.items() if key not in chance}
     off, left = _peeled(rig, known, cleared, set(rig.names) - three.keys(), options)
-    found = {name: f"lies {px:.1f} px off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
+    found = {name: f"lies {_far(px)} off its neighbours in the median, others {_usual(left):.1f}: " + WRONG
              for name, px in off.items()}  # fmt: skip
     kept = rig.select(name for name in rig.names if name not in off)
     right = [
@@ -108,7 +108,7 @@ def doubts(
         found[WHOLE] = f"fits the pictures better with {better}: its lenses are not those of these videos"
     elif left and _usual(left) > limit:
         found[WHOLE] = (
-            f"misses the pictures by {_usual(left):.1f} px in the median, right ones by 0.1 to 0.3: focal lengths, "
+            f"misses the pictures by {_far(_usual(left))} in the median, right ones by 0.1 to 0.3: focal lengths, "
             "principal points, distortion or poses are not those of these videos"
         )
     if WHOLE in found:  # where all are wrong, nothing tells of one
@@ -280,3 +280,8 @@ def _accused(camera: Camera, pairs: Medians, options: DoubtOptions) -> bool:
 
 def _usual(pairs: Medians) -> float:
     return float(np.median(list(pairs.values()))) if pairs else 0.0
+
+
+def _far(px: float) -> str:
+    """Infinite where most of what is matched lies behind a camera."""
+    return f"{px:.1f} px" if np.isfinite(px) else "more than can be measured, most matches lying behind a camera,"

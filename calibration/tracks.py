@@ -51,7 +51,8 @@ class _Forest:
 
     def __init__(self, starts: Mapping[int, int], place_counts: Mapping[int, int]) -> None:
         self._camera = np.repeat(list(starts), [place_counts[camera] for camera in starts]).astype(np.int32)
-        self._place = np.concatenate([np.arange(place_counts[camera]) for camera in starts]).astype(np.int32)
+        places = [np.arange(place_counts[camera], dtype=np.int32) for camera in starts]
+        self._place = np.concatenate([np.empty(0, np.int32), *places])
         self._parent = list(range(len(self._camera)))
         self._seen_by = [1 << camera for camera in self._camera.tolist()]
 

@@ -135,3 +135,8 @@ def test_the_nearest_match_wins_a_conflict():
     right = Link(0, 1, np.array([[0, 0]], np.int32), np.array([4], np.int32))
     point, camera, place = chain([wrong, right], {0: 2, 1: 2}, min_views=2)
     assert (point.tolist(), camera.tolist(), place.tolist()) == ([0, 0], [0, 1], [0, 0])
+
+
+@pytest.mark.parametrize("counts", [{}, {0: 0, 1: 0}])
+def test_pictures_without_features_have_no_tracks(counts):
+    assert [len(part) for part in chain([], counts, min_views=2)] == [0, 0, 0]
