@@ -7,9 +7,13 @@ from pathlib import Path
 from signal import SIG_IGN, SIGHUP, SIGINT, getsignal, signal
 
 import pytest
+from hypothesis import settings
 
 from tests.support.needs import need, need_data, promised
 from tests.support.places import DATA
+
+settings.register_profile("untimed", deadline=None)  # no test is right or wrong by how busy the machine is
+settings.load_profile("untimed")
 
 
 def pytest_configure() -> None:
