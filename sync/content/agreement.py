@@ -43,6 +43,14 @@ def agreement(
     return parts
 
 
+def shifted(rows: np.ndarray, by: int) -> np.ndarray:
+    """Rows moved down by so many; 0 comes in."""
+    moved = np.zeros_like(rows)
+    if abs(by) < len(rows):
+        moved[max(0, by) : len(rows) + min(0, by)] = rows[max(0, -by) : len(rows) - max(0, by)]
+    return moved
+
+
 def _centred(signal: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Less the mean of each line over a while, 0 at instants without a picture."""
     known = np.where(there[:, None], signal, 0.0).astype(np.float64)

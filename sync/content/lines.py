@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from sync.content.activity import Activity
-from sync.content.agreement import agreement
+from sync.content.agreement import agreement, shifted
 
 LINES = 64
 """That two cameras share, about"""
@@ -54,26 +54,23 @@ class SharedLines:
 
     def agreements(self, places: np.ndarray) -> list[Agreements]:
         """Of each kind of signal if the cameras' pictures were so many instants later, int [C]."""
-        return [
-            {pair: self._agreement(number, pair, places) for pair in kind} for number, kind in enumerate(self._kinds)
-        ]
+        return [self._agreements(kind, places) for kind in range(len(self._kinds))]
+
+    def sharpest(self, places: np.ndarray) -> Agreements:
+        """The same of the signal that is sharpest in time."""
+        return self._agreements(len(self._kinds) - 1, places)
+
+    def _agreements(self, kind: int, places: np.ndarray) -> Agreements:
+        return {pair: self._agreement(kind, pair, places) for pair in self._kinds[kind]}
 
     def _agreement(self, kind: int, pair: Pair, places: np.ndarray) -> np.ndarray:
         moved = [int(places[camera]) for camera in pair]
         at = (kind, *pair, *moved)
         if at not in self._known:
-            a, b = (_later(signal, by) for signal, by in zip(self._kinds[kind][pair], moved, strict=True))
-            there_a, there_b = (_later(self._there[camera], by) for camera, by in zip(pair, moved, strict=True))
+            a, b = (shifted(signal, by) for signal, by in zip(self._kinds[kind][pair], moved, strict=True))
+            there_a, there_b = (shifted(self._there[camera], by) for camera, by in zip(pair, moved, strict=True))
             self._known[at] = agreement(a, b, there_a, there_b, self._reach)
         return self._known[at]
-
-
-def _later(rows: np.ndarray, by: int) -> np.ndarray:
-    """Rows moved down by so many; 0 comes in."""
-    moved = np.zeros_like(rows)
-    if abs(by) < len(rows):
-        moved[max(0, by) : len(rows) + min(0, by)] = rows[max(0, -by) : len(rows) - max(0, by)]
-    return moved
 
 
 def _pairs(seen: Sequence[Activity]) -> Iterator[Pair]:

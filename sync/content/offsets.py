@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from sync.content.activity import Activity
-from sync.content.agreement import BLOCKS, LEAST_OVERLAP
+from sync.content.agreement import BLOCKS, LEAST_OVERLAP, shifted
 from sync.content.lines import Agreements, SharedLines
 
 APART = 2 / 3
@@ -147,7 +147,7 @@ def find_offsets(
     if reach < 1:
         return {}
     lines = SharedLines(cameras, farthest)
-    *_, pairs = lines.agreements(np.zeros(len(names), np.int64))
+    pairs = lines.sharpest(np.zeros(len(names), np.int64))
     if not pairs:
         return {}
     start = np.zeros(len(names), np.int64) if paired else _grown(pairs, len(names), reach)
@@ -274,7 +274,7 @@ def against_others(agreements: Agreements, camera: int, places: np.ndarray) -> n
     for (first, second), levels in agreements.items():
         if camera in (first, second) and levels.any():
             own, other = (levels, second) if camera == first else (levels[::-1], first)
-            found.append(_shifted(own, int(places[other])))
+            found.append(shifted(own, int(places[other])))
     return np.array(found).reshape(-1, offsets, BLOCKS)
 
 
@@ -282,16 +282,6 @@ def _within(levels: np.ndarray, reach: int) -> np.ndarray:
     """Of levels [..., 2 farthest + 1, BLOCKS] those up to an offset."""
     middle = levels.shape[-2] // 2
     return levels[..., middle - reach : middle + reach + 1, :]
-
-
-def _shifted(levels: np.ndarray, by: int) -> np.ndarray:
-    """Rows moved down by so many; 0 comes in."""
-    moved = np.zeros_like(levels)
-    if by >= 0:
-        moved[by:] = levels[: len(levels) - by]
-    else:
-        moved[:by] = levels[-by:]
-    return moved
 
 
 def _locate(own: np.ndarray, reach: int) -> Offset:
