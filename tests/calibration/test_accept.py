@@ -68,7 +68,7 @@ def test_the_common_sphere_is_seen_as_promised():
     assert (seen >= 3).mean() == pytest.approx(0.9, abs=0.03)  # 4,000 samples and a grid of 41 a side
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.floats(1e-3, 1e3), st.tuples(*[st.floats(-100, 100)] * 3))
 def test_the_report_moves_and_grows_with_the_world(turn, scale, shift):
     rotation = cv2.Rodrigues(np.array(turn))[0]

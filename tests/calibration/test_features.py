@@ -33,7 +33,7 @@ def naive(a: np.ndarray, b: np.ndarray, allowed: np.ndarray, ratio: float) -> li
     return found
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.integers(0, 12), st.integers(0, 12), st.integers(0, 2**32 - 1), st.sampled_from([0.7, 0.9, 1.0]), st.booleans()
 )

@@ -34,7 +34,7 @@ def fisheyes(count: int = 4) -> Rig:
     return Rig(tuple(cameras), "fisheyes")
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=1, max_size=20),
     st.tuples(st.floats(-0.02, 0.1), st.floats(-0.01, 0.02), st.floats(0, 0.005), st.floats(0, 0.002)),

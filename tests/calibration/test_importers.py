@@ -61,7 +61,7 @@ def assert_same(loaded: Rig, rig: Rig) -> None:
         assert np.allclose(a.camera_from_world, b.camera_from_world, rtol=0, atol=POSE_TOLERANCE)
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(rigs())
 def test_colmap_text_round_trip(tmp_path_factory, rig):
     folder = tmp_path_factory.mktemp("colmap")
@@ -69,7 +69,7 @@ def test_colmap_text_round_trip(tmp_path_factory, rig):
     assert_same(load_rig(folder), rig)
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(rigs(coefficients=(0, 4, 5)))
 def test_transforms_round_trip(tmp_path_factory, rig):
     path = tmp_path_factory.mktemp("transforms") / "transforms.json"
@@ -417,7 +417,7 @@ def llff_rigs(draw):
     return Rig(tuple(sorted(plain, key=lambda camera: natural_key(camera.name))), "drawn")
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(llff_rigs())
 def test_poses_bounds_round_trip(tmp_path_factory, rig):
     path = tmp_path_factory.mktemp("llff") / "poses_bounds.npy"

@@ -203,7 +203,7 @@ def test_lengths_that_disagree_are_a_finding():
 
 
 @given(st.floats(0.01, 100), st.tuples(*(st.floats(-3, 3),) * 3))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_a_scaled_rig_shows_scaled_points_where_the_rig_showed_them(factor, vector):
     rig, _ = turned(room(3), vector, 1.0, 0.5)
     points = np.array([[0.1, 0.2, 0.3], [-0.4, 0.1, 0.2]])

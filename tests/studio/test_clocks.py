@@ -18,7 +18,7 @@ from sync.timecode import read_timecodes
 RATES = [Fraction(30), Fraction(30000, 1001), Fraction(25), Fraction(50), Fraction(90), Fraction(120)]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     cameras=st.integers(2, 12),
     frames=st.integers(6, 80),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sync.align import (
@@ -55,7 +55,6 @@ def align_if_any(files: list[list[int]], **options: object) -> tuple[dict[str, T
 
 
 @given(st.lists(MESSY, min_size=2, max_size=4), st.integers(0, 200), st.booleans())
-@settings(deadline=None)
 def test_matching_equals_a_search_in_the_index(files: list[list[int]], tolerance: int, mutual: bool) -> None:
     timecodes, groups = align_if_any(files, tolerance_ns=tolerance, mutual=mutual)
     index = build_index(timecodes)
@@ -78,7 +77,6 @@ def test_matching_equals_a_search_in_the_index(files: list[list[int]], tolerance
 
 
 @given(st.lists(MESSY, min_size=2, max_size=4), st.integers(0, 3000))
-@settings(deadline=None)
 def test_no_frame_serves_two_instants(files: list[list[int]], tolerance: int) -> None:
     timecodes, groups = align_if_any(files, tolerance_ns=tolerance)
     if groups is None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sync.align import AlignOptions, SyncReport, align
@@ -87,7 +87,6 @@ WHATEVER = st.text(alphabet="0123456789.,;:-+eET#Z \t\nfrm_a", max_size=60)
 
 
 @given(WHATEVER, st.sampled_from([".txt", ".csv", ".json", ".log"]))
-@settings(deadline=None)
 def test_no_text_is_more_than_refused(tmp_path_factory: pytest.TempPathFactory, text: str, suffix: str) -> None:
     path, problem = tmp_path_factory.mktemp("any") / f"a{suffix}", ""
     path.write_text(text)

@@ -31,7 +31,7 @@ def labels_from(number: int, count: int, rate: Fraction, *, drop: bool = False) 
     return [frame_to_label(number + k, rate, drop_frame=drop) for k in range(count)]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     rate_drop=st.sampled_from([*((rate, False) for rate in RATES), (DROP_RATE, True)]),
     start=st.floats(0, 1),
@@ -155,7 +155,7 @@ def test_misread_digits_are_not_believed() -> None:
     assert times.jumps == 0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     rate=st.sampled_from(RATES),
     louder=st.floats(0, 3),
@@ -185,7 +185,7 @@ def test_labels_of_which_most_are_misread_are_no_times() -> None:
     assert _of_frames(_Labels(np.arange(200) / 25, fields, False), rate, np.arange(200) * 40_000_000) is None
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.lists(st.tuples(st.floats(-2, 2), st.integers(1, 4000)), max_size=60))
 def test_any_sound_is_heard_or_not(parts):
     sound = np.concatenate([np.full(length, level, np.float32) for level, length in parts] or [np.zeros(0)])

@@ -44,7 +44,7 @@ def write_video(path: Path, frames: int, rate: int) -> None:
 TEXTS = st.text("abC_ .-", max_size=6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     prefix=TEXTS.filter(lambda text: not text.startswith(".")),
     suffix=TEXTS,

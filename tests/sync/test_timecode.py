@@ -9,7 +9,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import sync.timecode.labels
@@ -51,7 +51,6 @@ def columns(path: Path, **options: object) -> tuple[list[int], list[int]]:
 
 
 @given(st.integers(0, 10**15), st.lists(st.integers(-(10**6), 10**7), max_size=30), st.integers(0, 10**11))
-@settings(deadline=None)
 def test_rig_text_round_trips(
     tmp_path_factory: pytest.TempPathFactory, start: int, gaps: list[int], first: int
 ) -> None:
@@ -140,7 +139,6 @@ def test_missing_files_and_other_suffixes(tmp_path: Path) -> None:
 
 
 @given(st.decimals(-4 * 10**9, 4 * 10**9, places=13) | st.decimals(-4, 4, places=25))
-@settings(deadline=None)
 def test_decimal_seconds_are_exact(tmp_path_factory: pytest.TempPathFactory, seconds: Decimal) -> None:
     path = write(tmp_path_factory.mktemp("csv") / "a.csv", f"time_s\n{seconds:f}\n")
     expected = int(seconds.scaleb(9).quantize(Decimal(1), ROUND_HALF_UP))
@@ -148,7 +146,6 @@ def test_decimal_seconds_are_exact(tmp_path_factory: pytest.TempPathFactory, sec
 
 
 @given(st.integers(-(10**18), 10**18), st.integers(-30, 30))
-@settings(deadline=None)
 def test_scientific_notation_is_exact(tmp_path_factory: pytest.TempPathFactory, digits: int, power: int) -> None:
     path = write(tmp_path_factory.mktemp("csv") / "a.csv", f"time_ns\n{digits}e{power}\n")
     size = Fraction(abs(digits)) * Fraction(10) ** power

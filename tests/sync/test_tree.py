@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import sync.tree
@@ -77,7 +77,6 @@ def test_random_operations_equal_the_twin(seed: int, tmp_path: Path) -> None:
 
 
 @given(st.lists(TIMES, max_size=60), st.lists(TIMES, min_size=1, max_size=20), st.integers(0, 2 * TIME_LIMIT_NS))
-@settings(deadline=None)
 def test_any_times_equal_the_twin(times: list[int], asked: list[int], tolerance: int) -> None:
     tree, twin = tree_of(times), Twin()
     for frame, time in enumerate(times):
@@ -90,7 +89,6 @@ def test_any_times_equal_the_twin(times: list[int], asked: list[int], tolerance:
 
 
 @given(st.lists(TIMES, max_size=60), st.lists(TIMES, max_size=60), st.integers(0, 2 * TIME_LIMIT_NS))
-@settings(deadline=None)
 def test_merge_equals_search(times: list[int], asked: list[int], tolerance: int) -> None:
     tree, queries = tree_of(times), np.array(sorted(asked), np.int64)
     keys, frames = tree.items()
@@ -101,7 +99,6 @@ def test_merge_equals_search(times: list[int], asked: list[int], tolerance: int)
 
 
 @given(st.lists(TIMES, max_size=60), st.lists(TIMES, max_size=60), st.integers(0, 2 * TIME_LIMIT_NS))
-@settings(deadline=None)
 def test_merge_with_later_ties_is_the_merge_read_backwards(times: list[int], asked: list[int], tolerance: int) -> None:
     keys, queries = tree_of(times).items()[0], np.array(sorted(asked), np.int64)
     positions, residuals = merge_nearest(keys, queries, tolerance, tie_later=True)

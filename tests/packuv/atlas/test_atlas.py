@@ -81,7 +81,7 @@ def as_set(codes):
 # Pictures
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 2), st.integers(0, 2**32 - 1), st.sampled_from([16, 64]))
 def test_triplets_give_back_what_is_visible(tmp_path, degree, seed, size):
     path = write_random_scene(tmp_path / "a.mkv", degree=degree, seed=seed)

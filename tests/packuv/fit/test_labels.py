@@ -105,7 +105,7 @@ def random_mask(rng: np.random.Generator) -> np.ndarray:
     return (x + 0.5 - cx) ** 2 + (y + 0.5 - cy) ** 2 < radius**2
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.1, 0.7]))
 def test_hits_equal_the_algorithm_pixel_by_pixel(seed: int, overlap: float) -> None:
     rng = np.random.default_rng(seed)
@@ -206,7 +206,7 @@ def test_what_is_not_drawn_or_not_a_number_stays_static() -> None:
     assert found.tolist() == [False, False, False, False, True]
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(st.integers(0, 2**32 - 1))
 def test_active_tiles_hold_every_pixel_that_is_drawn(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -68,7 +68,7 @@ def test_matches_the_definition(size, share):
     assert_matches(*pictures(*size), PhotometricOptions(share))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 130), st.integers(1, 130), st.integers(1, 4), st.floats(0.05, 0.95), st.integers(0, 2**20))
 def test_matches_the_definition_on_some_tiles(height, width, channels, share, seed):
     tiles = some_tiles(height, width, share, seed)

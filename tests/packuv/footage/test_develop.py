@@ -54,7 +54,7 @@ def coding(name: str, bits: int, tags: Tags = UNTAGGED, *, width: int = 64, heig
     return Coding(name, bits, matrix, transfer, primaries, span, width, height)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     sampling=st.sampled_from(sorted(SUBSAMPLED)),
     bits=st.sampled_from([8, 10, 12]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from packuv.camera import PinholeCamera
@@ -42,14 +42,12 @@ def test_without_gain_shading_and_light_a_picture_is_filmed_as_it_is():
     assert np.allclose(response.shown(PICTURE), PICTURE, atol=1e-7)
 
 
-@settings(deadline=None)
 @given(st.tuples(*[st.floats(-2, 1)] * 3).map(np.array))
 def test_a_plain_camera_films_the_lit_picture(light):
     response = Response.of(LensCamera(PINHOLE), PINHOLE, light)
     assert np.abs(response.shown(PICTURE) - np.clip(lit(PICTURE, light), 0, 1)).max() < 1e-6  # float32
 
 
-@settings(deadline=None)
 @given(st.tuples(gain, gain, gain), st.floats(-0.6, 0.3), st.floats(-0.1, 0.1))
 def test_what_is_filmed_is_linear_light_times_shading_over_gain(gains, k1, k2):
     response = Response.of(LensCamera(PINHOLE, gains=gains, shading=(k1, k2)), PINHOLE)
@@ -60,7 +58,6 @@ def test_what_is_filmed_is_linear_light_times_shading_over_gain(gains, k1, k2):
     assert np.abs(response.shown(PICTURE) - wanted)[bright].max() < 1e-4
 
 
-@settings(deadline=None)
 @given(responses)
 def test_undone_is_the_inverse_of_shown_where_nothing_is_clipped(response):
     shown = response.shown(PICTURE)
@@ -68,7 +65,6 @@ def test_undone_is_the_inverse_of_shown_where_nothing_is_clipped(response):
     assert np.abs(response.undone(shown) - PICTURE)[inside].max() < 2e-6
 
 
-@settings(deadline=None)
 @given(responses, st.integers(0, 2**31))
 def test_carried_is_the_derivative_of_shown(response, seed):
     direction = np.random.default_rng(seed).normal(0, 1e-2, PICTURE.shape).astype(np.float32)
@@ -96,7 +92,6 @@ def test_lamps_are_clipped_and_come_back_only_where_the_camera_was_not():
     assert (response.carried(np.ones_like(lamp)) > 0).all()
 
 
-@settings(deadline=None)
 @given(responses, st.sampled_from([2, 3, 0.5]))
 def test_a_picture_of_another_size_has_the_same_response(response, scale):
     flat = np.full((3, HEIGHT, WIDTH), 0.3, np.float32)

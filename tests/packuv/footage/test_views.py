@@ -67,7 +67,7 @@ def remux(source: Path, target: Path, *arguments: str) -> Path:
     return target
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(order=st.lists(st.integers(0, COUNT - 1), min_size=1, max_size=12))
 def test_any_order_gives_the_frames_that_were_written(video: Path, order: list[int]) -> None:
     reader, truth = FrameReader({"a": video}), numbered()

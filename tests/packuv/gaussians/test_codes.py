@@ -24,7 +24,7 @@ def codes(seed: int, count: int = 200, sh_degree: int = 1) -> Codes:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_what_was_decoded_encodes_to_the_same_codes(seed):
     q, c = quantizer(), codes(seed)
     again = q.encode(q.decode(c))

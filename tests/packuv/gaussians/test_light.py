@@ -18,7 +18,7 @@ light = st.tuples(*[st.floats(-0.6, 0.6)] * 3).map(np.array)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(light)
 def test_lit_gaussians_draw_the_lit_picture(degree, light):
     options, steady = RasterOptions(near=0.1), wall(degree)

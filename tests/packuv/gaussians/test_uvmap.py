@@ -80,7 +80,7 @@ def naive_cascade(texels, opacity, options):
     return result
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 400), st.integers(0, 2**32 - 1), st.integers(1, 5))
 def test_the_cascade_equals_its_naive_twin(count, seed, levels):
     rng = np.random.default_rng(seed)
@@ -98,7 +98,6 @@ def test_one_texel_keeps_its_k_most_opaque():
     assert np.array_equal(np.argsort(slots.layer[slots.kept]), np.argsort(-opacity[slots.kept]))
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(*[st.floats(-1e6, 1e6) | st.sampled_from([0.0, -0.0, 1e-300])] * 3), min_size=1, max_size=50))
 def test_no_point_leaves_the_map(points):
     texels = sphere_texels(np.array(points), ORIGIN, options=SMALL)

@@ -40,7 +40,7 @@ def as_set(codes):
 # Rows
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=2), st.integers(0, 2**32 - 1))
 def test_equal_codes_pair_off_like_their_naive_twin(counts, seed):
     rng = np.random.default_rng(seed)
@@ -59,7 +59,7 @@ def test_equal_codes_pair_off_like_their_naive_twin(counts, seed):
             free.remove(same[0])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.integers(1, 40), min_size=1, max_size=12), st.integers(1, 6), st.integers(0, 2**32 - 1), st.booleans()
 )

@@ -27,7 +27,7 @@ def header_of(path):
     return path.read_bytes().split(b"end_header\n")[0].decode().splitlines()
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 50), st.integers(0, 3), st.integers(0, 2**32 - 1))
 def test_what_is_written_is_read_exactly(tmp_path, count, degree, seed):
     gaussians = random_gaussians(count, degree, seed)
@@ -84,7 +84,7 @@ def test_columns_are_found_by_name_in_any_order_and_type(tmp_path):
         assert np.array_equal(getattr(back, name), getattr(gaussians, name))
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_file_cut_anywhere_is_refused(tmp_path, data):
     write_ply(tmp_path / "a.ply", random_gaussians(7, 1))
@@ -195,7 +195,7 @@ def in_written_order(gaussians, written):
     return rows_of(gaussians, rows)
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 600), st.integers(0, 3), st.integers(0, 2**32 - 1))
 def test_a_compressed_ply_that_is_written_is_read_within_its_own_precision(tmp_path, count, degree, seed):
     gaussians = random_gaussians(count, degree, seed)

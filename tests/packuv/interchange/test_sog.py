@@ -94,7 +94,7 @@ def write_folder(folder, files):
         (folder / name).write_bytes(content)
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(1, 300), st.integers(0, 3), st.integers(0, 2**32 - 1))
 def test_archives_and_folders_are_read_within_their_steps(tmp_path, count, degree, seed):
     truth = random_gaussians(count, degree, seed)
@@ -157,7 +157,7 @@ def test_missing_pictures_and_other_folders_are_refused(tmp_path):
         read_sog(tmp_path / "a")
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_an_archive_cut_or_changed_anywhere_is_read_or_refused_in_one_sentence(tmp_path, data):
     write_archive(tmp_path / "a.sog", sog(random_gaussians(9, 1)))

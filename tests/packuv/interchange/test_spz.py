@@ -48,7 +48,7 @@ def assert_near(back, truth):
     assert (np.abs(back.sh[:, 1:] - higher) <= np.where(np.abs(higher) > 1 - steps, 1.01, 0.501) * steps).all()
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 60), st.integers(0, 3), st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 300.0, 9e5]))
 def test_what_is_written_is_read_within_half_a_step(tmp_path, count, degree, seed, size):
     truth = random_gaussians(count, degree, seed)
@@ -225,7 +225,7 @@ def test_version_2_keeps_x_y_z_of_the_rotation(tmp_path):
     assert rotation_error(back, truth)[steady].max() < ROTATION_V2
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_file_cut_or_changed_anywhere_is_read_or_refused_in_one_sentence(tmp_path, data):
     header, streams = stored_streams(random_gaussians(9, 1), tmp_path / "a.spz")

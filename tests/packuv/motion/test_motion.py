@@ -61,7 +61,7 @@ def cover(mask: np.ndarray, radius_px: int = 3) -> np.ndarray:
     return grown(mask, WIDTH, HEIGHT, radius_px)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(dx=st.integers(-9, 9), dy=st.integers(-9, 9))
 def test_optical_flow_and_mask_of_a_moving_disc(dx: int, dy: int) -> None:
     step = measure_step(picture(150, 90), picture(150 + dx, 90 + dy), MotionOptions(flow_width=WIDTH))

@@ -54,7 +54,7 @@ def test_a_plate_of_the_same_light_stays_as_it_is_and_shows_what_a_person_hides(
 
 
 @given(gains=st.tuples(*[st.floats(0.75, 1.3)] * 3))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_another_light_is_undone(gains: tuple[float, float, float]):
     plate = compare_plate(still(lit(wall(), gains)), still(with_person(wall())), OPTIONS)
     assert plate.fits

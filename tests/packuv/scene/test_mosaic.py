@@ -14,7 +14,7 @@ def test_the_hilbert_curve_fills_a_block_step_by_step():
     assert (x[0], y[0], x[-1], y[-1]) == (0, 0, BLOCK - 1, 0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 3000), st.sets(st.integers(0, 60), min_size=1, max_size=61), st.integers(0, 2**32 - 1))
 def test_a_mosaic_gives_back_its_rows(count, chosen, seed):
     channels = tuple(sorted(chosen))
@@ -38,7 +38,7 @@ def test_cells_of_a_plane_are_its_own():
     assert mosaic.capacity >= 3000
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 1500), st.integers(0, 1500), st.integers(0, 2**32 - 1))
 def test_flags_and_rows_do_not_touch_each_other(rows, flags, seed):
     rng = np.random.default_rng(seed)

@@ -124,7 +124,7 @@ def scene_file(tmp_path_factory):
 # Round trips
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.integers(0, 2**32 - 1),
     st.lists(
@@ -477,7 +477,7 @@ def complaint(path, frames):
     return report.problem
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_file_cut_anywhere_says_so(scene_file, tmp_path, data):
     content = scene_file[0].read_bytes()
@@ -500,7 +500,7 @@ def test_a_file_cut_inside_its_second_copy_says_so_and_reads_whole(scene_file, t
     assert "something else follows" in complaint(longer, scene_file[1])
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_flipped_bit_never_gives_wrong_codes(scene_file, tmp_path, data):
     content = bytearray(scene_file[0].read_bytes())
@@ -756,7 +756,7 @@ def parts(scene_file):
     return document, packets, tracks
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_header_with_odd_values_is_refused_or_reads_without_a_crash(parts, tmp_path, data):
     document, packets, tracks = parts

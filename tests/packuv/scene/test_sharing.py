@@ -74,7 +74,7 @@ def test_morton_codes_interleave_the_bits():
         assert code == sum((position[a] >> b & 1) << (3 * b + a) for b in range(16) for a in range(3))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 300), st.integers(1, 5), st.integers(0, 2**32 - 1))
 def test_rows_go_dynamic_first_then_along_the_curve(count, values, seed):
     rng = np.random.default_rng(seed)
@@ -85,7 +85,7 @@ def test_rows_go_dynamic_first_then_along_the_curve(count, values, seed):
     assert sorted(order.tolist()) == list(range(count))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 80), st.integers(0, 80), st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_every_row_is_matched_that_can_be_and_none_twice(first, second, values, seed):
     rng = np.random.default_rng(seed)
@@ -102,7 +102,7 @@ def test_every_row_is_matched_that_can_be_and_none_twice(first, second, values, 
     assert len(here) == common
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(sequences, st.integers(1, 4))
 def test_plans_give_back_every_key_within_reach(segments, reach):
     planner, keys, plans = KeyPlanner(reach), [], []
@@ -122,7 +122,7 @@ def test_plans_give_back_every_key_within_reach(segments, reach):
         assert steps <= reach
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(sequences, st.integers(1, 4))
 def test_stored_order_only_permutes_rows(segments, reach):
     planner = KeyPlanner(reach)

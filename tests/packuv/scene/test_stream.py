@@ -85,7 +85,7 @@ def test_channel_names_are_one_per_byte():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 300), st.integers(0, 3))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_key_bytes_are_reversible(seed, count, degree):
     codes = random_codes(np.random.default_rng(seed), count, attribute_count(degree))
     assert same(key_codes(key_rows(codes)), codes)
@@ -108,7 +108,7 @@ def play(stored, tolerance=EXACT, *, channels=None):
         yield playback.codes
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(segments)
 def test_changes_give_back_every_code(segment):
     stored = in_stored_order(segment)
@@ -116,7 +116,7 @@ def test_changes_give_back_every_code(segment):
         assert same(codes, stored.frame(index))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(segments, st.integers(0, 5))
 def test_channels_that_never_change_need_no_plane(segment, frozen):
     segment.attributes[:, :, frozen] = segment.key.attributes[segment.dynamic, frozen]
@@ -130,7 +130,7 @@ def test_channels_that_never_change_need_no_plane(segment, frozen):
         assert (change.rows[:, ~changing] == NEUTRAL).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(segments)
 def test_only_rows_that_change_are_stored(segment):
     stored = in_stored_order(segment)
@@ -152,7 +152,7 @@ def test_only_rows_that_change_are_stored(segment):
 tolerances = st.builds(Tolerance, st.sampled_from([0, 1, 16, 300, 8192]), st.sampled_from([0, 1, 3, 32]))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(segments, tolerances)
 def test_no_code_errs_by_more_than_the_tolerance_and_presence_never(segment, tolerance):
     stored = in_stored_order(segment)
@@ -257,7 +257,7 @@ def test_entropy_is_that_of_the_definition():
 # Absence
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(segments)
 def test_holding_absent_rows_changes_nothing_that_is_seen(segment):
     held = hold_absent(segment)
@@ -269,7 +269,7 @@ def test_holding_absent_rows_changes_nothing_that_is_seen(segment):
         assert same(before[~segment.dynamic], after[~segment.dynamic])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(segments)
 def test_held_rows_store_nothing_but_their_opacity_while_absent(segment):
     stored = in_stored_order(hold_absent(segment))
@@ -297,7 +297,7 @@ def quantizer(degree=0, centre=(0.0, 0.0, 0.0), unit=1.0, reach=20.0):
     return Quantizer(np.array(centre, float), unit, np.full(3, reach), low, high, degree)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.floats(0.01, 100), st.floats(0.5, 1000), st.floats(-50, 50))
 def test_every_position_code_survives_decoding(unit, reach_in_units, centre_in_units):
     # Holds while float32 resolves the finest step at the centre: |centre| 2^-24 < unit * edge / 65535 / 2.

@@ -114,7 +114,7 @@ def same(a, b):
 # Pictures
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 3000), st.integers(1, 70), st.integers(0, 2**32 - 1))
 def test_a_picture_holds_every_byte_once(capacity, planes, seed):
     sheet = Sheet.of(capacity, planes)
@@ -136,7 +136,7 @@ def test_pictures_stay_within_what_browsers_decode():
         Sheet.of(20_000_000, 61)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 40), st.integers(0, 2), st.integers(0, 2**32 - 1))
 def test_bytes_of_rows_add_up(count, degree, seed):
     rng = np.random.default_rng(seed)

@@ -80,7 +80,7 @@ def assert_same(left: Codes, right: Codes) -> None:
 # ---- bytes
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     lengths=st.lists(st.integers(1, 4), min_size=1, max_size=3),
@@ -106,7 +106,7 @@ def test_what_is_sent_decodes_to_the_codes(
         assert page.key(number)[1] == part.dynamic.sum()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 60), sh_degree=st.integers(0, 2))
 def test_rows_that_an_earlier_key_has_are_taken_from_there(seed: int, count: int, sh_degree: int) -> None:
     """Rows that stay still, begin to move, cease to, and are gone, through two references; some are equal."""
@@ -360,7 +360,7 @@ def test_damage_reaches_the_page_as_words() -> None:
     assert (answer.status, body) == (500, b"/frames/1.bin: packet 3 is damaged\n")
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     asked=st.binary(max_size=300)
     | st.sampled_from([b"GET ", b"HEAD ", b"POST ", b"get "]).flatmap(
