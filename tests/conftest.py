@@ -7,16 +7,12 @@ from pathlib import Path
 from signal import SIG_IGN, SIGHUP, SIGINT, getsignal, signal
 
 import pytest
-from hypothesis import settings
 
 from tests.support.needs import need, need_data, promised
 from tests.support.places import DATA
 
-settings.register_profile("untimed", deadline=None)  # no test is right or wrong by how busy the machine is
-settings.load_profile("untimed")
 
-
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """A misspelt promise must not pass for none; what tests start must hear signals, also in a session that does not.
 
     A session in the background or under nohup ignores them, and hands that on; handlers are not handed on.
@@ -28,6 +24,16 @@ def pytest_configure() -> None:
         promised()
     except ValueError as error:
         raise pytest.UsageError(error) from None
+    if config.pluginmanager.hasplugin("hypothesispytest"):  # not on a bare machine with a GPU
+        _leave_properties_untimed()
+
+
+def _leave_properties_untimed() -> None:
+    """No test is right or wrong by how busy the machine is."""
+    from hypothesis import settings
+
+    settings.register_profile("untimed", deadline=None)
+    settings.load_profile("untimed")
 
 
 @pytest.hookimpl(tryfirst=True)  # before fixtures that only work where the need is met
