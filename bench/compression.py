@@ -28,11 +28,12 @@ import numpy as np
 
 from bench import command
 from bench.codec import Point, plot
-from packuv.compress import ITERATIONS
+from packuv.compress import usual_iterations
 from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import Steps
+from packuv.compress.targets import Targets
 from packuv.gaussians.codes import OPACITY, REST, Codes, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.metrics import decibels, ssim
@@ -76,8 +77,9 @@ class _Table:
         """The same of the rows that are worth their bits, moved to make up for the others."""
         started = time.perf_counter()
         judge, ticks = self._judge, Ticks(no_progress, 1)
-        rows = Rows(self._scene, judge.views, self._folder, near=judge.near, seed=0, ticks=ticks)
-        paths = rows.coarse(noise, steps, ITERATIONS)
+        targets = Targets(judge.views, None, (), near=judge.near)
+        rows = Rows(self._scene, targets, self._folder, near=judge.near, seed=0, ticks=ticks)
+        paths = rows.coarse(noise, steps, usual_iterations(len(self.segments)))
         facts = {"rows": rows.kept / rows.count, "seconds": round(time.perf_counter() - started, 1)}
         return {**self._measured(f"fewer, noise {noise:g}", paths, steps.tolerance, steps), **facts}
 

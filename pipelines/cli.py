@@ -567,7 +567,11 @@ def _compress(command: argparse.ArgumentParser) -> None:
     )
     known = command.add_mutually_exclusive_group()
     known.add_argument(
-        "--capture", type=Path, default=None, metavar="CAPTURE", help="score both scenes against this capture folder"
+        "--capture",
+        type=Path,
+        default=None,
+        metavar="CAPTURE",
+        help="what was filmed: codes move towards it, it says what is lost",
     )
     known.add_argument(
         "--fitted-db", type=float, default=None, metavar="DB", help="PSNR of the scene against footage (taken for 30)"
@@ -577,7 +581,8 @@ def _compress(command: argparse.ArgumentParser) -> None:
         type=int,
         default=None,
         metavar="N",
-        help="by which codes make up for what is left out, a segment (200); 0: quicker, and larger files",
+        help="by which codes make up for what is left out, a segment (1000 in all, but 200 at least); 0: quicker, and "
+        "larger files",
     )
     _seed(command)
     _output(command, "FILE", "scene file to write")

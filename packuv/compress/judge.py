@@ -1,8 +1,9 @@
-"""Pictures that tell how far a compressed scene is from the lossless one."""
+"""Pictures that tell how far a compressed scene is from the lossless one, and both from what was filmed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,34 @@ import numpy as np
 from packuv.colour import lit
 from packuv.compress.imagined import IMAGINED, looked_at
 from packuv.compress.views import Views
+from packuv.footage import Views as Footage
+from packuv.metrics import decibels
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene, open_scene
 
+EXACT = 1e-12
+"""Mean squared error of pictures that are told apart from equal ones, which have no PSNR"""
 FRAMES, CAMERAS = 3, 12
 """Of which pictures tell distortion, at most, spread evenly: 36 of them differ from all by some tenths of a decibel"""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of a compressed scene's pictures."""
+
+    mean: float
+    """Mean squared error to those of the lossless scene"""
+    unseen: float | None
+    """Of cameras from which nothing was learned; None where there are none"""
+    filmed_db: float | None
+    """PSNR against footage, of these cameras where there are any; None without footage"""
 
 
 class Judge:
     """Pictures of a scene, to which those of others are compared."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, footage: Footage | None = None) -> None:
+        """Raises ValueError for footage that has no picture to judge by."""
         header = looked_at(scene)
         held_out = [camera for camera in header.cameras if camera.name in header.held_out]
         fitted = [camera for camera in header.cameras if camera.name not in header.held_out]
@@ -38,15 +56,19 @@ class Judge:
         """What imagined cameras circle, JSON; None where the cameras are the scene's own"""
         self._options, self._arena = RasterOptions(near=self.near), Arena()
         self._truth = {(frame, name): picture for frame, name, picture in self._pictures(scene)}
+        self._footage = footage
+        self.fitted_db = None if footage is None else self._filmed_db(scene, footage)
+        """PSNR of the lossless scene, as `Errors.filmed_db`"""
 
-    def errors(self, path: Path) -> tuple[float, float | None]:
-        """Mean squared error of a scene file's pictures, and of those of cameras from which nothing was learned."""
-        wrong = [
-            (unseen, float(np.square(picture - truth, dtype=np.float64).mean()))
-            for unseen, picture, truth in self.pairs(path)
-        ]
+    def errors(self, path: Path) -> Errors:
+        """Of a scene file."""
+        wrong = [(unseen, _squared(picture, truth)) for unseen, picture, truth in self.pairs(path)]
         others = [error for unseen, error in wrong if unseen]
-        return float(np.mean([error for _, error in wrong])), float(np.mean(others)) if others else None
+        with open_scene(path) as scene:
+            filmed_db = None if self._footage is None else self._filmed_db(scene, self._footage)
+        return Errors(
+            float(np.mean([error for _, error in wrong])), float(np.mean(others)) if others else None, filmed_db
+        )
 
     def pairs(self, path: Path) -> Iterator[tuple[bool, np.ndarray, np.ndarray]]:
         """Whether nothing was learned from the camera, a scene file's picture and the true one, float32 [3, H, W]."""
@@ -61,6 +83,28 @@ class Judge:
             for camera in self.cameras:
                 drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
                 yield frame, camera.name, np.clip(lit(drawn, scene.light(frame)), 0, 1).astype(np.float32)
+
+    def _filmed_db(self, scene: Scene, footage: Footage) -> float:
+        """Mean over pictures, drawn as the cameras would film them."""
+        judged = self._unseen or {camera.name for camera in self.cameras}
+        found = []
+        for frame in self.frames:
+            gaussians = scene.gaussians(frame)
+            for number, camera in enumerate(footage.cameras):
+                if camera.name in judged and (filmed := footage.filmed(number, frame)) is not None:
+                    drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
+                    shown = footage.response(number, frame).shown(drawn)
+                    found.append(decibels(max(_squared(shown, filmed), EXACT)))
+        if not found:
+            raise ValueError(
+                f"{scene.path} must be compared with what {', '.join(sorted(judged))} filmed, but the capture has no "
+                f"picture of theirs at frames {', '.join(map(str, self.frames))}; leave the capture out"
+            )
+        return float(np.mean(found))
+
+
+def _squared(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.square(one - other, dtype=np.float64).mean())
 
 
 def _spread(items: Sequence[Any], count: int) -> list[Any]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from packuv.compress.steps import Steps
+from packuv.compress.targets import Targets
 from packuv.compress.tune import moved_segment, tune
-from packuv.compress.views import Views
 from packuv.compress.weigh import weigh, worth
 from packuv.gaussians.segment import Segment
 from packuv.progress import Ticks
@@ -35,12 +35,13 @@ class _Part:
 class Rows:
     """Segments of a scene, one in memory at a time."""
 
-    def __init__(self, scene: Scene, views: Views, folder: Path, *, near: float, seed: int, ticks: Ticks) -> None:
-        self._views, self._seed, self._ticks = views, seed, ticks
+    def __init__(self, scene: Scene, targets: Targets, folder: Path, *, near: float, seed: int, ticks: Ticks) -> None:
+        self._targets, self._seed, self._ticks = targets, seed, ticks
         self._quantizer, self._near = scene.header.quantizer, near
         self._parts: list[_Part] = []
         self.count = self.kept = 0
         """Rows of all segments, and of the last trial"""
+        self._passes = 0
         before = None
         for number in range(len(scene.index.segments)):
             before = self._unpack(scene.segment(number), number, before, folder)
@@ -59,7 +60,7 @@ class Rows:
         part = _Part(*(folder / f"{number}{name}" for name in names))
         segment.save(part.lossless)
         rng = np.random.default_rng([self._seed, number])
-        found = weigh(segment, self._quantizer, self._views, near=self._near, rng=rng, ticks=self._ticks)
+        found = weigh(segment, self._quantizer, self._targets.views, near=self._near, rng=rng, ticks=self._ticks)
         kin = np.full(len(segment.key), -1)
         if before is not None:
             there, here = match_rows(before.key, segment.key)
@@ -79,6 +80,7 @@ class Rows:
         A row that the segment before has already keeps what it has there, so that keys share it.
         """
         self.kept, before = 0, None
+        self._passes += iterations > 0
         for number, part in enumerate(self._parts):
             before = self._coarse(part, number, noise, steps, iterations, before)
         return [part.coarse for part in self._parts]
@@ -106,12 +108,12 @@ class Rows:
                 steps,
                 steps.quantizer(self._quantizer),
                 lambda frame: self._quantizer.decode(segment.frame(frame)),
-                self._views,
+                self._targets,
                 offsets[stays] / wide,
                 free=free[stays],
                 iterations=iterations,
                 near=self._near,
-                rng=np.random.default_rng([self._seed, number, 1]),
+                rng=np.random.default_rng([self._seed, number, self._passes]),
                 ticks=self._ticks,
             )
             coarse = moved_segment(coarse, found, steps)

@@ -11,32 +11,34 @@ from pathlib import Path
 from typing import Any
 
 from packuv.compress.imagined import IMAGINED
-from packuv.compress.judge import Judge
+from packuv.compress.judge import EXACT, Judge
 from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import Steps
+from packuv.compress.targets import Targets
 from packuv.compress.tune import DRAWN
 from packuv.compress.weigh import pictures_of
+from packuv.footage import Views as Footage
 from packuv.metrics import decibels
 from packuv.progress import Progress, Ticks, no_progress
 from packuv.scene import EncodeOptions, Scene, open_scene, write_scene
 from packuv.scene.header import COMPRESSION
 
 TRIALS = 14
-ITERATIONS = 200
-"""In which codes of a segment are moved"""
+ITERATIONS, FEWEST = 1000, 200
+"""In which codes of a scene are moved, and those of one of its segments at least"""
 AGAIN, CORRECTIONS = 4, 3
 """Further passes from there, each of so many times fewer iterations, until the goal is met"""
 FINEST = 1e-10
 """Noise of the finest steps that are tried, mean squared error of each kind of code"""
 COARSEST = 0.03
-EXACT = 1e-12
-"""Mean squared error of pictures that are told apart from equal ones, which have no PSNR"""
 LONGEST = {"psnr_db": -100.123, "psnr_held_out_db": -100.123, "loss_db": -100.1234}
 """Figures that take as many characters as any, in the header of trials"""
 RATIO_TOLERANCE, LOSS_TOLERANCE = 0.02, 0.03
 """Shares of the goal by which the result may stay on the safe side of it"""
 RATIO_SLOPE, LOSS_SLOPE = 0.35, 1.0
+STRIDE = math.log(3)
+"""Of the noise from a pass to the next one, at most: codes that move may leave no loss at all"""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,8 @@ class Compressed:
     psnr_held_out_db: float | None
     """Of cameras from which no step was learned; None where no camera is held out"""
     loss_db: float
-    """What that costs against footage, by the goal's `fitted_db`; of held-out cameras where there are any"""
+    """What that costs against footage, as it shows or by the goal's `fitted_db`; of held-out cameras where there are
+    any"""
     noise: float
     """Mean squared error that each kind of code was meant to add to pictures"""
     steps: Steps
@@ -113,7 +116,8 @@ def compress(
     target: Path,
     goal: Goal,
     *,
-    iterations: int = ITERATIONS,
+    footage: Footage | None = None,
+    iterations: int | None = None,
     seed: int = 0,
     threads: int = 0,
     progress: Progress = no_progress,
@@ -121,16 +125,17 @@ def compress(
     """Write a smaller scene file of a lossless one; the same input gives the same bytes.
 
     Distortion is that of the scene's own cameras, or of imagined ones where nobody filmed it, the lossless scene being
-    the truth. `iterations` are those of each segment in which codes are moved to make up for what is left out; with 0
-    they stay where they are. Raises ValueError where the scene is not lossless, shows nothing, or is too small to get
+    the truth. `footage` of these cameras, whose instant i is frame i, tells what is lost, and codes move towards it.
+    `iterations` are those of each segment in which they are moved to make up for what is left out (None: the usual
+    ones); with 0 they stay where they are. Raises ValueError where the scene is not lossless, shows nothing, or is too small to get
     smaller; where no steps reach the goal, with what can be reached.
     """
-    if iterations < 0:
+    if iterations is not None and iterations < 0:
         raise ValueError(f"iterations must be 0 or more, but are {iterations}")
     with open_scene(source, threads=threads) as scene:
         _check_lossless(scene)
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".packuv-") as folder:
-            work = _Work(scene, goal, Path(folder), iterations, seed, threads, progress)
+            work = _Work(scene, goal, footage, Path(folder), iterations, seed, threads, progress)
             return work.write(target, work.search())
 
 
@@ -138,11 +143,20 @@ class _Work:
     """One scene, whose steps are looked for."""
 
     def __init__(
-        self, scene: Scene, goal: Goal, folder: Path, iterations: int, seed: int, threads: int, progress: Progress
+        self,
+        scene: Scene,
+        goal: Goal,
+        footage: Footage | None,
+        folder: Path,
+        iterations: int | None,
+        seed: int,
+        threads: int,
+        progress: Progress,
     ) -> None:
         self._scene, self._goal, self._folder, self._threads = scene, goal, folder, threads
-        self._judge = Judge(scene)
+        self._judge = Judge(scene, footage)
         learned, segments = self._judge.learned, scene.index.segments
+        iterations = usual_iterations(len(segments)) if iterations is None else iterations
         self._passes = [iterations] + [-(-iterations // AGAIN)] * CORRECTIONS if iterations else []
         self._pictures = len(self._judge.cameras) * len(self._judge.frames)
         first = len(learned) * len(self._judge.frames)
@@ -154,7 +168,8 @@ class _Work:
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, near=near, seed=seed, ticks=ticks)
         if not self._sensitivity.any():
             raise ValueError(f"{scene.path} must show something to be compressed, but its cameras see nothing")
-        self._rows = Rows(scene, self._judge.views, folder, near=near, seed=seed, ticks=ticks)
+        targets = Targets(self._judge.views, footage, scene.header.held_out, near=near)
+        self._rows = Rows(scene, targets, folder, near=near, seed=seed, ticks=ticks)
         self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
         self._sound = scene.sound()
 
@@ -243,11 +258,13 @@ class _Work:
         path, segments = self._folder / "trial.mkv", self._rows.coarse(noise, steps, iterations)
         rows = self._rows.kept / self._rows.count
         size = self._encode(path, segments, steps, rows, LONGEST)
-        error, unseen = self._judge.errors(path)
+        errors = self._judge.errors(path)
         self._ticks.advance(self._pictures)
-        psnr_db = decibels(max(error, EXACT))
-        unseen_db = None if unseen is None else decibels(max(unseen, EXACT))
+        psnr_db = decibels(max(errors.mean, EXACT))
+        unseen_db = None if errors.unseen is None else decibels(max(errors.unseen, EXACT))
         loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)
+        if errors.filmed_db is not None and self._judge.fitted_db is not None:
+            loss_db = self._judge.fitted_db - errors.filmed_db
         imagined = self._judge.imagined is not None
         return Compressed(self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps, rows, imagined)
 
@@ -270,19 +287,26 @@ class _Work:
             "position_multiple": steps.multiple,
             "attribute_steps": steps.attribute.tolist(),
             "fitted_db": self._goal.fitted_db,
+            "filmed": self._judge.fitted_db is not None,
             "cameras": [camera.name for camera in self._judge.cameras],
             "frames": list(self._judge.frames),
             **({IMAGINED: self._judge.imagined} if self._judge.imagined else {}),
         }
 
 
+def usual_iterations(segments: int) -> int:
+    """In which the codes of each of so many segments are moved."""
+    return max(FEWEST, ITERATIONS // segments)
+
+
 def _ahead(tried: Sequence[tuple[float, float]], aim: float, slope: float) -> float:
-    """Where a straight line through the last two points meets the aim, or one of this slope through the last."""
+    """Where a straight line through the last two points meets the aim, or one of this slope through the last; no
+    further from there than STRIDE."""
     (x, y), before = tried[-1], tried[-2:-1]
     if before and x != before[0][0]:
         steep = (y - before[0][1]) / (x - before[0][0])
         slope = min(max(steep, slope / 3), 3 * slope)
-    return x + (aim - y) / slope
+    return x + min(max((aim - y) / slope, -STRIDE), STRIDE)
 
 
 def _check_lossless(scene: Scene) -> None:

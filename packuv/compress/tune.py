@@ -1,30 +1,31 @@
-"""Coarse codes, moved so that pictures of them are those of the lossless scene."""
+"""Coarse codes, moved so that pictures of them are what they shall be."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from packuv.compress.sensitivity import by_code
 from packuv.compress.steps import Steps
-from packuv.compress.views import Views
+from packuv.compress.targets import Targets
 from packuv.gaussians.codes import OPACITY, Codes, Quantizer
 from packuv.gaussians.floats import Gaussians
 from packuv.gaussians.segment import Segment
 from packuv.progress import Ticks
-from packuv.raster import Arena, RasterOptions, gradients, render
+from packuv.raster import RasterOptions, gradients, render
 
 RATE = 0.11
 """Steps by which an iteration moves a code whose gradient is that of its kind; in the second half less and less"""
 DRAWN = 4
-"""Pictures that take as long to draw as an iteration: it draws two, and goes back through one"""
+"""Pictures that take as long to draw as an iteration: it draws two, or reads one, and goes back through one"""
 FADING, SQUARES_FADING = 0.9, 0.99
 """Of the last gradients and their squares in their means"""
-ALIKE = 10.0
+ALIKE = 2.0
 """By how much the gradients of a kind count against the row's own: where each row moves alike however little it does,
-as with Adam, codes of no weight wander off, and their bits with them (5 % larger and 1 dB worse)"""
+as with Adam, codes of no weight wander off, and their bits with them. Measured, docs/compression.md"""
 
 
 def tune(
@@ -32,7 +33,7 @@ def tune(
     steps: Steps,
     quantizer: Quantizer,
     truth: Callable[[int], Gaussians],
-    views: Views,
+    targets: Targets,
     offsets: np.ndarray,
     *,
     free: np.ndarray,
@@ -43,20 +44,20 @@ def tune(
 ) -> np.ndarray:
     """By how much to move each row throughout a segment in coarse steps, float64 [N, 3 + A], codes of these steps.
 
-    `offsets` are where to begin, `free` bool [N] who may move, `truth` the Gaussians of a frame in the lossless scene,
-    from whose pictures those of `moved` codes shall differ least. One picture an iteration, of a frame and a camera
-    by chance; a gradient is that of the codes as they are drawn, rounded, and moves what rounds to them.
+    `offsets` are where to begin, `free` bool [N] who may move, `truth` the Gaussians of a segment's frame in the
+    lossless scene. One picture an iteration, of a frame by chance and a target there, from which that of `moved` codes
+    shall differ least; a gradient is that of the codes as they are drawn, rounded, and moves what rounds to them.
     """
-    options, arena, unit = RasterOptions(near=near), Arena(), _unit(steps, offsets.shape[1])
+    options, unit = RasterOptions(near=near), _unit(steps, offsets.shape[1])
     mean, squares = np.zeros_like(offsets), np.zeros_like(offsets)
     for iteration in range(iterations):
-        frame, camera = int(rng.integers(len(segment))), views.draw(rng)
-        wanted = np.clip(render(truth(frame), camera, options=options, arena=arena).colour, 0, 1)
+        frame = int(rng.integers(len(segment)))
+        target = targets.draw(segment.first + frame, partial(truth, frame), rng)
         codes = moved(segment.frame(frame), offsets, steps)
         gaussians = quantizer.decode(codes)
-        drawn = render(gaussians, camera, options=options)
-        error = np.clip(drawn.colour, 0, 1) - wanted
-        slope = by_code(gradients(drawn, error, rows=free), gaussians, codes, quantizer) * unit
+        drawn = render(gaussians, target.camera, options=options)
+        pull = target.pull(drawn.colour)
+        slope = by_code(gradients(drawn, pull, rows=free), gaussians, codes, quantizer) * unit
         mean = FADING * mean + (1 - FADING) * slope
         squares = SQUARES_FADING * squares + (1 - SQUARES_FADING) * np.square(slope)
         near_now = 1 - FADING ** (iteration + 1), 1 - SQUARES_FADING ** (iteration + 1)

@@ -63,17 +63,21 @@ def _search(
 
     Raises ValueError where no search reaches that; then nothing is written.
     """
-    from packuv.compress import ITERATIONS, compress
+    from packuv.compress import compress
+    from packuv.scene import open_scene
+    from tasks.stages.evaluate import filmed_views
 
-    tuned = ITERATIONS if arguments.iterations is None else arguments.iterations
+    footage = None
+    if arguments.capture:
+        with open_scene(arguments.scene) as scene:
+            footage = filmed_views(scene.header, arguments.capture)
     asked, lost, place = goal.loss_db, 0.0, partial_path(arguments.output, ".mkv")
     try:
         for number in range(SEARCHES):
             try:
                 with shown(arguments, "compress") as progress:
-                    found = compress(
-                        arguments.scene, place, goal, iterations=tuned, seed=arguments.seed, progress=progress
-                    )
+                    found = compress(arguments.scene, place, goal, footage=footage, iterations=arguments.iterations,
+                                     seed=arguments.seed, progress=progress)  # fmt: skip
             except ValueError:
                 if number:  # no steps are so fine
                     break

@@ -159,11 +159,12 @@ def known_cameras(header: SceneHeader) -> tuple[str, ...]:
     return tuple(_lenses(header.extra))
 
 
-def filmed_views(header: SceneHeader, capture: Path, cameras: Sequence[str]) -> Views:
-    """What these cameras of a capture folder filmed at the instants of a scene, frame by frame. Raises ValueError for
-    a capture that did not film them."""
+def filmed_views(header: SceneHeader, capture: Path, cameras: Sequence[str] | None = None) -> Views:
+    """What these cameras of a capture folder filmed at the instants of a scene, frame by frame; None: all that both
+    have. Raises ValueError for a capture that did not film them."""
     groups, lenses = _matched(capture, header.sync), _lenses(header.extra)
     rows = _rows(groups, header.times_ns)
+    cameras = [name for name in lenses if name in groups.cameras] if cameras is None else cameras
     if unknown := [name for name in cameras if name not in groups.cameras]:
         raise ValueError(f"{capture} has no camera {', '.join(unknown)}; it has {', '.join(groups.cameras)}")
     frames = groups.frames[rows][:, [groups.cameras.index(name) for name in cameras]]

@@ -99,9 +99,9 @@ def test_a_still_scene_that_nobody_filmed_is_compressed_and_says_so(tmp_path, de
         assert small.header.cameras == ()
     assert said["imagined"] == judge.imagined
     assert all(name.startswith("imagined") for name in said["cameras"])
-    error, unseen = judge.errors(tmp_path / "small.mkv")
-    assert decibels(error) == pytest.approx(found.psnr_db)
-    assert decibels(unseen) == pytest.approx(found.psnr_held_out_db)
+    errors = judge.errors(tmp_path / "small.mkv")
+    assert decibels(errors.mean) == pytest.approx(found.psnr_db)
+    assert decibels(errors.unseen) == pytest.approx(found.psnr_held_out_db)
     assert found.loss_db == pytest.approx(GOAL.loss(found.psnr_held_out_db))
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from packuv.compress.rows import Rows
 from packuv.compress.steps import Steps
+from packuv.compress.targets import Targets
 from packuv.compress.tune import moved, moved_segment, tune
 from packuv.compress.views import LEAST, MOST, Views
 from packuv.compress.weigh import pictures_of, weigh, worth
@@ -124,7 +125,7 @@ def test_tuning_makes_up_for_who_is_left_out_and_leaves_others_alone(cameras):
         COARSE,
         COARSE.quantizer(quantizer),
         lambda frame: quantizer.decode(lossless.frame(frame)),
-        Views(cameras),
+        Targets(Views(cameras), None, (), near=NEAR),
         np.zeros((len(free), COLUMNS)),
         free=free,
         iterations=40,
@@ -139,7 +140,8 @@ def test_tuning_makes_up_for_who_is_left_out_and_leaves_others_alone(cameras):
 
 def test_keys_of_equal_rows_stay_equal_when_they_are_tuned(cameras, tmp_path):
     with open_scene(small_scene(tmp_path / "scene.mkv")) as scene:
-        rows = Rows(scene, Views(cameras), tmp_path, near=NEAR, seed=0, ticks=ticks())
+        targets = Targets(Views(cameras), None, (), near=NEAR)
+        rows = Rows(scene, targets, tmp_path, near=NEAR, seed=0, ticks=ticks())
         first, second = (Segment.load(path) for path in rows.coarse(1e-7, COARSE, 10))
     assert 0 < rows.kept < rows.count == 2 * ROWS
     where = {row.tobytes() for row in np.hstack([first.key.xyz, first.key.attributes.astype(np.uint16)])}
