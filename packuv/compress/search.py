@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from packuv.compress.brief import brief
 from packuv.compress.imagined import IMAGINED
 from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
@@ -257,7 +258,7 @@ class _Work:
         """Write segments in these steps, with these figures in the header; the file's size in bytes."""
         header = self._scene.header
         extra = {**header.extra, COMPRESSION: {**self._said(steps), "rows": round(rows, 4), **figures}}
-        stated = replace(header, quantizer=steps.quantizer(header.quantizer), extra=extra)
+        stated = brief(replace(header, quantizer=steps.quantizer(header.quantizer), extra=extra))
         options = EncodeOptions(steps.tolerance)
         return write_scene(path, segments, stated, sound=self._sound, options=options, threads=self._threads).bytes
 
