@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from packuv.compress.brief import brief
 from packuv.compress.imagined import IMAGINED
 from packuv.compress.judge import EXACT, Judge
 from packuv.compress.rows import Rows
@@ -127,8 +128,9 @@ def compress(
     Distortion is that of the scene's own cameras, or of imagined ones where nobody filmed it, the lossless scene being
     the truth. `footage` of these cameras, whose instant i is frame i, tells what is lost, and codes move towards it.
     `iterations` are those of each segment in which they are moved to make up for what is left out (None: the usual
-    ones); with 0 they stay where they are. Raises ValueError where the scene is not lossless, shows nothing, or is too small to get
-    smaller; where no steps reach the goal, with what can be reached.
+    ones); with 0 they stay where they are. Raises ValueError where the scene is not lossless, shows nothing, or is too
+    small to get smaller; where no steps reach the goal, with what can be reached; for footage without a picture to
+    judge by.
     """
     if iterations is not None and iterations < 0:
         raise ValueError(f"iterations must be 0 or more, but are {iterations}")
@@ -274,7 +276,7 @@ class _Work:
         """Write segments in these steps, with these figures in the header; the file's size in bytes."""
         header = self._scene.header
         extra = {**header.extra, COMPRESSION: {**self._said(steps), "rows": round(rows, 4), **figures}}
-        stated = replace(header, quantizer=steps.quantizer(header.quantizer), extra=extra)
+        stated = brief(replace(header, quantizer=steps.quantizer(header.quantizer), extra=extra))
         options = EncodeOptions(steps.tolerance)
         return write_scene(path, segments, stated, sound=self._sound, options=options, threads=self._threads).bytes
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
-from packuv.bounds import field, finite, items, numbers
+from packuv.bounds import MOST_CAMERAS, field, fields, finite, items, numbers, words
 from packuv.camera import PinholeCamera
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
@@ -73,6 +73,41 @@ class LensCamera:
     def straight(self) -> bool:
         """Whether the lens shows what a pinhole would."""
         return not self.fisheye and not any(self.distortion)
+
+
+def abridged(lenses: Iterable[LensCamera], cameras: Sequence[PinholeCamera]) -> list[dict[str, Any]]:
+    """JSON of lenses that stands beside that of `cameras`, among which each lens has one of its name.
+
+    An entry holds this name, and what a lens that leaves that camera's pictures as they are would not say.
+    """
+    plain = _plain(cameras)
+    pairs = ((lens.to_json(), plain[lens.pinhole.name]) for lens in lenses)
+    return [{key: said for key, said in own.items() if key == "name" or said != like.get(key)} for own, like in pairs]
+
+
+def unabridged(entries: object, cameras: Sequence[PinholeCamera], what: str) -> dict[str, LensCamera]:
+    """Lenses by name, the inverse of `abridged`; entries may also say all, as in older files.
+
+    Raises ValueError that names `what` for a name that no camera has, or two entries; for others that make no sense.
+    """
+    plain, lenses = _plain(cameras), dict[str, LensCamera]()
+    for entry in items(entries, what, most=MOST_CAMERAS):
+        name = words(field(fields(entry, f"{what}: an entry"), "name", f"{what}: an entry"), f"{what}: a name")
+        if name not in plain or name in lenses:
+            raise ValueError(
+                f"{what} must name cameras of the scene, each once, but names {name!r}, which "
+                f"{'it named before' if name in lenses else 'is none of them'}"
+            )
+        lenses[name] = LensCamera.from_json({**plain[name], **entry})
+    return lenses
+
+
+def _plain(cameras: Sequence[PinholeCamera]) -> dict[str, dict[str, Any]]:
+    """JSON of lenses that leave these cameras' pictures as they are, by name."""
+    plain = {camera.name: LensCamera(camera).to_json() for camera in cameras}
+    if len(plain) < len(cameras):
+        raise ValueError(f"cameras must differ in name, but {len(cameras)} have {len(plain)} names")
+    return plain
 
 
 def undistorted_camera(lens: LensCamera) -> PinholeCamera:

@@ -13,7 +13,7 @@ import numpy as np
 from packuv.files import save_json
 from packuv.fit.keyframe import KeyState
 from packuv.footage import Light
-from packuv.footage.lens import undistorted_camera
+from packuv.footage.lens import abridged, undistorted_camera
 from packuv.footage.light import packed
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.segment import Segment
@@ -37,7 +37,7 @@ SCENE = "scene.mkv"
 class Encode(Stage):
     """Write the scene file from the segments, in order; by default lossless."""
 
-    name, version = "encode", 6
+    name, version = "encode", 7
     take: Take
     """All cameras"""
     held_out: tuple[str, ...]
@@ -125,11 +125,13 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState, lig
     """
     groups = footage.site.path(footage.take.groups)
     rig, report, transfer = footage.load_rig(), SyncReport.load(groups), footage.take.pictures.transfer
+    lenses = [lens_camera(camera) for camera in rig.cameras]
+    cameras = tuple(map(undistorted_camera, lenses))
     return SceneHeader(
         quantizer=key.quantizer,
         times_ns=np.ascontiguousarray(footage.load_groups().times_ns),
         rate=_rate(groups),
-        cameras=tuple(undistorted_camera(lens_camera(camera)) for camera in rig.cameras),
+        cameras=cameras,
         held_out=held_out,
         sync={
             "reference": report.reference,
@@ -148,7 +150,7 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState, lig
             # Absent where nobody knows it, likewise below, so that scenes keep their bytes.
             **({"up": list(rig.up)} if rig.up else {}),
             "max_width": footage.take.pictures.max_width,
-            "lenses": [lens_camera(camera).to_json() for camera in rig.cameras],
+            "lenses": abridged(lenses, cameras),
             # Absent where tags decide, so that scenes of such captures keep their bytes.
             **({"transfer": str(transfer)} if transfer else {}),
             **({"exposure": {name: packed(own) for name, own in light.exposures.items()}} if light else {}),

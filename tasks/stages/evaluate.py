@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from packuv.bounds import MOST_CAMERAS, MOST_NS, MOST_SIDE_PX, field, fields, items, whole
+from packuv.bounds import MOST_NS, MOST_SIDE_PX, field, fields, whole
 from packuv.files import save_json
 from packuv.footage import LensCamera, Light, Silhouettes, Transfer, Views, laid_over
+from packuv.footage.lens import unabridged
 from packuv.footage.light import unpacked
 from packuv.lpips import Lpips, lacking
 from packuv.motion import MotionOptions, measure_motion
@@ -141,7 +142,7 @@ def evaluate_scene(
         raise ValueError(why)
     with open_scene(scene) as opened:
         header = opened.header
-        lenses = _lenses(header.extra)
+        lenses = _lenses(header)
         fitted = [name for name in lenses if name not in header.held_out]
         names = tuple(cameras or header.held_out) or spread(fitted, options.fitted_cameras)
         if unknown := [name for name in names if name not in lenses]:
@@ -156,13 +157,13 @@ def evaluate_scene(
 
 def known_cameras(header: SceneHeader) -> tuple[str, ...]:
     """Cameras whose pictures can be compared with a scene."""
-    return tuple(_lenses(header.extra))
+    return tuple(_lenses(header))
 
 
 def filmed_views(header: SceneHeader, capture: Path, cameras: Sequence[str] | None = None) -> Views:
     """What these cameras of a capture folder filmed at the instants of a scene, frame by frame; None: all that both
     have. Raises ValueError for a capture that did not film them."""
-    groups, lenses = _matched(capture, header.sync), _lenses(header.extra)
+    groups, lenses = _matched(capture, header.sync), _lenses(header)
     rows = _rows(groups, header.times_ns)
     cameras = [name for name in lenses if name in groups.cameras] if cameras is None else cameras
     if unknown := [name for name in cameras if name not in groups.cameras]:
@@ -194,16 +195,15 @@ def _silhouettes(capture: Path, views: Views) -> tuple[Silhouettes | None, dict[
     return Silhouettes(laid, but=doubtful), doubtful
 
 
-def _lenses(extra: Mapping[str, Any]) -> dict[str, LensCamera]:
+def _lenses(header: SceneHeader) -> dict[str, LensCamera]:
     """The scene's cameras as they film, by name. Raises ValueError where a scene does not tell, as imported ones do
     not."""
-    if "lenses" not in extra:
+    if "lenses" not in header.extra:
         raise ValueError(
             "what was filmed can be compared with a scene that says how its cameras film (extra.lenses), but this one "
             "does not, as imported ones; leave the capture out"
         )
-    listed = items(field(extra, "lenses", "the scene's header: extra"), "extra: lenses", most=MOST_CAMERAS)
-    return {lens.pinhole.name: lens for lens in map(LensCamera.from_json, listed)}
+    return unabridged(header.extra["lenses"], header.cameras, "extra: lenses")
 
 
 def _light(header: SceneHeader) -> Light:

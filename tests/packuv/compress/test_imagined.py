@@ -86,6 +86,11 @@ def test_up_is_that_of_splat_files_or_of_the_map_where_nothing_is_said(tmp_path)
         assert header.near > 0
 
 
+def circled(imagined):
+    """What a header says of imagined cameras, to the digits that one of a compressed scene has."""
+    return np.float32([*imagined["up"], *(place for ball, radius in imagined["spheres"] for place in (*ball, radius))])
+
+
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_still_scene_that_nobody_filmed_is_compressed_and_says_so(tmp_path, degree):
     scene = still_scene(tmp_path / "scene.mkv", degree=degree)
@@ -97,7 +102,7 @@ def test_a_still_scene_that_nobody_filmed_is_compressed_and_says_so(tmp_path, de
     with open_scene(scene) as source, open_scene(tmp_path / "small.mkv") as small:
         said, judge = small.header.extra["compression"], Judge(source)
         assert small.header.cameras == ()
-    assert said["imagined"] == judge.imagined
+    assert np.array_equal(*map(circled, (said["imagined"], judge.imagined)))
     assert all(name.startswith("imagined") for name in said["cameras"])
     errors = judge.errors(tmp_path / "small.mkv")
     assert decibels(errors.mean) == pytest.approx(found.psnr_db)

@@ -19,8 +19,10 @@ from sync.align import AlignOptions, align
 from sync.timecode import Timecodes
 from tasks.artefacts.stage import Site
 from tasks.stages.encode import SCENE, Encode, Verify, scene_header
+from tasks.stages.evaluate import _lenses as filmed_lenses
+from tasks.stages.evaluate import known_cameras
 from tasks.stages.fitting import SEGMENT
-from tasks.stages.footage import RIG, Footage, Take
+from tasks.stages.footage import RIG, Footage, Take, lens_camera
 from tests.support.artefacts import build_here, put
 from tests.support.calibration_scene import ring
 from tests.support.sounds import write_video
@@ -132,6 +134,25 @@ def test_the_header_says_where_up_is_where_that_is_known(site, take, key):
     header = scene_header(Footage(upright, site), (), KeyState.load(site.path(key)))
     assert header.up == (0.0, -0.6, 0.8)
     assert header.extra["metric"] is True
+
+
+def test_the_header_says_of_lenses_what_cameras_do_not_and_older_ones_all(site, take, key):
+    footage = Footage(take, site)
+    rig = footage.load_rig()
+    bent = replace(rig, cameras=(replace(rig.cameras[0], distortion=(-0.05, 0.0, 0.0, 0.0)), *rig.cameras[1:]))
+    header = scene_header(
+        Footage(replace(take, rig=put(site, "rig", lambda out: bent.save(out / RIG), bent="one")), site),
+        (),
+        KeyState.load(site.path(key)),
+    )
+    assert [set(entry) for entry in header.extra["lenses"]] == [{"name", "fx", "fy", "distortion"}, {"name"}, {"name"}]
+    wanted = [lens_camera(camera).to_json() for camera in bent.cameras]
+    for extra in (header.extra, {**header.extra, "lenses": wanted}):
+        found = filmed_lenses(replace(header, extra=extra))
+        assert [lens.to_json() for lens in found.values()] == wanted
+    lost = replace(header, extra={**header.extra, "lenses": [{"name": "other"}]})
+    with pytest.raises(ValueError, match="extra: lenses must name cameras of the scene, each once, but names 'other'"):
+        known_cameras(lost)
 
 
 def test_what_is_fitted_so_far_plays_and_grows_into_the_whole(site, take, key, fitted, tmp_path):
