@@ -29,6 +29,7 @@ import numpy as np
 from bench import command
 from bench.codec import Point, plot
 from packuv.compress import usual_iterations
+from packuv.compress.brief import brief
 from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
@@ -85,7 +86,7 @@ class _Table:
 
     def _measured(self, name: str, paths: list[Path], tolerance: Tolerance, steps: Steps | None) -> dict[str, Any]:
         header = self._scene.header
-        header = replace(header, quantizer=steps.quantizer(header.quantizer)) if steps else header
+        header = brief(replace(header, quantizer=steps.quantizer(header.quantizer))) if steps else header
         file = self._folder / "row.mkv"
         written = write_scene(file, paths, header, options=EncodeOptions(tolerance))
         return {

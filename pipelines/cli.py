@@ -581,7 +581,7 @@ def _compress(command: argparse.ArgumentParser) -> None:
         type=int,
         default=None,
         metavar="N",
-        help="by which codes make up for what is left out, a segment (1000 in all, but 200 at least); 0: quicker, and "
+        help="by which codes make up for what is left out, a segment (600 in all, but 200 at least); 0: quicker, and "
         "larger files",
     )
     _seed(command)

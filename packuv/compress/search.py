@@ -26,7 +26,7 @@ from packuv.scene import EncodeOptions, Scene, open_scene, write_scene
 from packuv.scene.header import COMPRESSION
 
 TRIALS = 14
-ITERATIONS, FEWEST = 1000, 200
+ITERATIONS, FEWEST = 600, 200
 """In which codes of a scene are moved, and those of one of its segments at least"""
 AGAIN, CORRECTIONS = 4, 3
 """Further passes from there, each of so many times fewer iterations, until the goal is met"""

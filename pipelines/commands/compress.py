@@ -15,6 +15,7 @@ from pipelines.disk import size_text
 
 if TYPE_CHECKING:
     from packuv.compress import Compressed, Goal
+    from packuv.footage import Views as Footage
 
 SEARCHES = 4
 """Of which each aims at less than the one before, where footage shows a loss above what was asked for"""
@@ -64,13 +65,8 @@ def _search(
     Raises ValueError where no search reaches that; then nothing is written.
     """
     from packuv.compress import compress
-    from packuv.scene import open_scene
-    from tasks.stages.evaluate import filmed_views
 
-    footage = None
-    if arguments.capture:
-        with open_scene(arguments.scene) as scene:
-            footage = filmed_views(scene.header, arguments.capture)
+    footage = _footage(arguments.scene, arguments.capture) if arguments.capture else None
     asked, lost, place = goal.loss_db, 0.0, partial_path(arguments.output, ".mkv")
     try:
         for number in range(SEARCHES):
@@ -104,6 +100,15 @@ def _check_filmed(path: Path) -> None:
             raise ValueError(
                 f"a capture scores scenes that its cameras filmed, but no camera filmed {path}; leave out --capture"
             )
+
+
+def _footage(scene: Path, capture: Path) -> Footage:
+    """What the scene's cameras filmed, frame by frame."""
+    from packuv.scene import open_scene
+    from tasks.stages.evaluate import filmed_views
+
+    with open_scene(scene) as opened:
+        return filmed_views(opened.header, capture)
 
 
 def _scores(arguments: argparse.Namespace, scene: Path) -> dict[str, float]:

@@ -64,6 +64,7 @@ def test_the_loss_that_footage_shows_is_what_was_asked_for_at_most(
         return {"psnr_db": 30 - factor * said["loss_db"], "ssim": 0.9}
 
     monkeypatch.setattr(compress, "_scores", scores)
+    monkeypatch.setattr(compress, "_footage", lambda *_: None)
     small = tmp_path / "small.mkv"
     words = ["compress", str(lossless), "--loss-db", "0.5", "--capture", str(tmp_path), "-o", str(small), "--json"]
     words += ["--iterations", "10"]
