@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,15 @@ from packuv.colour import lit
 from packuv.compress.imagined import IMAGINED, looked_at
 from packuv.compress.views import Views
 from packuv.footage import Views as Footage
+from packuv.gaussians.floats import Gaussians
 from packuv.metrics import decibels
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene, open_scene
 
 EXACT = 1e-12
 """Mean squared error of pictures that are told apart from equal ones, which have no PSNR"""
+UNLIKE_DB = 6.0
+"""By how much less than the middle one a camera that films something else is like the lossless scene"""
 FRAMES, CAMERAS = 3, 12
 """Of which pictures tell distortion, at most, spread evenly: 36 of them differ from all by some tenths of a decibel"""
 
@@ -31,8 +34,9 @@ class Errors:
     """Mean squared error to those of the lossless scene"""
     unseen: float | None
     """Of cameras from which nothing was learned; None where there are none"""
-    filmed_db: float | None
-    """PSNR against footage, of these cameras where there are any; None without footage"""
+    lost_db: float | None
+    """By how much PSNR against footage has fallen, the larger of that of these cameras and that of the others; None
+    without footage"""
 
 
 class Judge:
@@ -57,18 +61,23 @@ class Judge:
         self._options, self._arena = RasterOptions(near=self.near), Arena()
         self._truth = {(frame, name): picture for frame, name, picture in self._pictures(scene)}
         self._footage = footage
-        self.fitted_db = None if footage is None else self._filmed_db(scene, footage)
-        """PSNR of the lossless scene, as `Errors.filmed_db`"""
+        self.followed = () if footage is None else self._alike(scene, footage, {camera.name for camera in fitted})
+        """Fitted cameras whose footage shows what the scene does"""
+        names = () if footage is None else tuple(camera.name for camera in fitted)
+        self.unfollowed = tuple(name for name in names if name not in self.followed)
+        self.filmed = footage is not None
+        self._fitted = None if footage is None else self._filmed(scene, footage)
 
     def errors(self, path: Path) -> Errors:
         """Of a scene file."""
         wrong = [(unseen, _squared(picture, truth)) for unseen, picture, truth in self.pairs(path)]
         others = [error for unseen, error in wrong if unseen]
+        mean, unseen = float(np.mean([error for _, error in wrong])), float(np.mean(others)) if others else None
+        if self._footage is None or self._fitted is None:
+            return Errors(mean, unseen, None)
         with open_scene(path) as scene:
-            filmed_db = None if self._footage is None else self._filmed_db(scene, self._footage)
-        return Errors(
-            float(np.mean([error for _, error in wrong])), float(np.mean(others)) if others else None, filmed_db
-        )
+            now = self._filmed(scene, self._footage)
+        return Errors(mean, unseen, max(level - now[group] for group, level in self._fitted.items()))
 
     def pairs(self, path: Path) -> Iterator[tuple[bool, np.ndarray, np.ndarray]]:
         """Whether nothing was learned from the camera, a scene file's picture and the true one, float32 [3, H, W]."""
@@ -84,23 +93,42 @@ class Judge:
                 drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
                 yield frame, camera.name, np.clip(lit(drawn, scene.light(frame)), 0, 1).astype(np.float32)
 
-    def _filmed_db(self, scene: Scene, footage: Footage) -> float:
-        """Mean over pictures, drawn as the cameras would film them."""
-        judged = self._unseen or {camera.name for camera in self.cameras}
-        found = []
+    def _filmed(self, scene: Scene, footage: Footage) -> dict[bool, float]:
+        """PSNR against footage, mean over pictures, of cameras from which nothing was learned (True) and of others."""
+        found = dict[bool, list[float]]()
+        judged = self._unseen | ({camera.name for camera in self.cameras} & set(self.followed))
         for frame in self.frames:
             gaussians = scene.gaussians(frame)
             for number, camera in enumerate(footage.cameras):
-                if camera.name in judged and (filmed := footage.filmed(number, frame)) is not None:
-                    drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
-                    shown = footage.response(number, frame).shown(drawn)
-                    found.append(decibels(max(_squared(shown, filmed), EXACT)))
-        if not found:
+                level = self._level(gaussians, footage, number, frame) if camera.name in judged else None
+                if level is not None:
+                    found.setdefault(camera.name in self._unseen, []).append(level)
+        if not found or (self._unseen and True not in found):
+            names = sorted(self._unseen or (camera.name for camera in self.cameras))
             raise ValueError(
-                f"{scene.path} must be compared with what {', '.join(sorted(judged))} filmed, but the capture has no "
-                f"picture of theirs at frames {', '.join(map(str, self.frames))}; leave the capture out"
+                f"{scene.path} must be compared with what {', '.join(names)} filmed, but the capture has no picture of "
+                f"theirs at frames {', '.join(map(str, self.frames))}; leave the capture out"
             )
-        return float(np.mean(found))
+        return {group: float(np.mean(levels)) for group, levels in found.items()}
+
+    def _alike(self, scene: Scene, footage: Footage, fitted: Collection[str]) -> tuple[str, ...]:
+        """Cameras of these whose first picture at one of the frames is about as near to the scene's as others' are."""
+        levels = dict[str, float]()
+        for frame in self.frames:
+            gaussians = scene.gaussians(frame)
+            for number, name in enumerate(footage.names):
+                if name in fitted and name not in levels:
+                    level = self._level(gaussians, footage, number, frame)
+                    levels.update({} if level is None else {name: level})
+        least = np.median([*levels.values()]) - UNLIKE_DB if levels else 0.0
+        return tuple(name for name, level in levels.items() if level >= least)
+
+    def _level(self, gaussians: Gaussians, footage: Footage, number: int, frame: int) -> float | None:
+        """PSNR of a camera's picture, drawn as it would film it, dB; None where it has none."""
+        if (filmed := footage.filmed(number, frame)) is None:
+            return None
+        drawn = render(gaussians, footage.cameras[number], options=self._options, arena=self._arena).colour
+        return decibels(max(_squared(footage.response(number, frame).shown(drawn), filmed), EXACT))
 
 
 def _squared(one: np.ndarray, other: np.ndarray) -> float:

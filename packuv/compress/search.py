@@ -97,15 +97,19 @@ class Compressed:
     psnr_held_out_db: float | None
     """Of cameras from which no step was learned; None where no camera is held out"""
     loss_db: float
-    """What that costs against footage, as it shows or by the goal's `fitted_db`; of held-out cameras where there are
-    any"""
+    """What that costs against footage: what it shows, the larger loss of held-out and of fitted cameras, or by the
+    goal's `fitted_db`, of held-out cameras where there are any"""
     noise: float
     """Mean squared error that each kind of code was meant to add to pictures"""
     steps: Steps
     rows: float
     """Share of the rows of all segments that are still there"""
+    moved: bool
+    """Whether codes were moved; they stay where they were if that makes no better pictures"""
     imagined: bool
     """Whether the pictures are of imagined cameras, as nobody filmed the scene"""
+    unfollowed: tuple[str, ...]
+    """Fitted cameras towards whose footage, if any is given, no codes moved: it is missing, or shows something else"""
 
     @property
     def ratio(self) -> float:
@@ -170,7 +174,7 @@ class _Work:
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, near=near, seed=seed, ticks=ticks)
         if not self._sensitivity.any():
             raise ValueError(f"{scene.path} must show something to be compressed, but its cameras see nothing")
-        targets = Targets(self._judge.views, footage, scene.header.held_out, near=near)
+        targets = Targets(self._judge.views, footage, self._judge.followed, near=near)
         self._rows = Rows(scene, targets, folder, near=near, seed=seed, ticks=ticks)
         self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
         self._sound = scene.sound()
@@ -265,10 +269,13 @@ class _Work:
         psnr_db = decibels(max(errors.mean, EXACT))
         unseen_db = None if errors.unseen is None else decibels(max(errors.unseen, EXACT))
         loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)
-        if errors.filmed_db is not None and self._judge.fitted_db is not None:
-            loss_db = self._judge.fitted_db - errors.filmed_db
+        if errors.lost_db is not None:
+            loss_db = errors.lost_db
         imagined = self._judge.imagined is not None
-        return Compressed(self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps, rows, imagined)
+        return Compressed(
+            self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps, rows, iterations > 0, imagined,
+            self._judge.unfollowed,
+        )  # fmt: skip
 
     def _encode(
         self, path: Path, segments: Sequence[Path], steps: Steps, rows: float, figures: Mapping[str, Any]
@@ -289,7 +296,7 @@ class _Work:
             "position_multiple": steps.multiple,
             "attribute_steps": steps.attribute.tolist(),
             "fitted_db": self._goal.fitted_db,
-            "filmed": self._judge.fitted_db is not None,
+            "filmed": self._judge.filmed,
             "cameras": [camera.name for camera in self._judge.cameras],
             "frames": list(self._judge.frames),
             **({IMAGINED: self._judge.imagined} if self._judge.imagined else {}),

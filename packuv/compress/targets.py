@@ -36,11 +36,11 @@ class Target:
 class Targets:
     """Pictures by chance."""
 
-    def __init__(self, views: Views, footage: Footage | None, held_out: Collection[str], *, near: float) -> None:
-        """Instant i of `footage` is frame i of the scene; cameras that are `held_out` of it set no targets."""
+    def __init__(self, views: Views, footage: Footage | None, followed: Collection[str], *, near: float) -> None:
+        """Instant i of `footage` is frame i of the scene; cameras that are not `followed` set no targets."""
         self.views, self._footage = views, footage
         names = footage.names if footage else ()
-        self._filming = [number for number, name in enumerate(names) if name not in held_out]
+        self._filming = [number for number, name in enumerate(names) if name in followed]
         self._options, self._arena = RasterOptions(near=near), Arena()
 
     def draw(self, frame: int, lossless: Callable[[], Gaussians], rng: np.random.Generator) -> Target:

@@ -49,7 +49,9 @@ def command(arguments: argparse.Namespace) -> int:
         "position_steps": (found.steps.position * found.steps.multiple).tolist(),
         "attribute_steps": found.steps.attribute.tolist(),
         "rows": found.rows,
+        "moved": found.moved,
         "imagined": found.imagined,
+        "unfollowed": list(found.unfollowed),
     }
     if filmed:
         facts["filmed"] = {"lossless": filmed, "compressed": scores}
@@ -126,10 +128,11 @@ def _text(facts: Mapping[str, Any]) -> str:
     views = ", from views that were imagined, for no camera filmed it" if facts["imagined"] else ""
     assumed = "assumed; there is none" if facts["imagined"] else "assumed; --capture measures it"
     source = {"capture": "measured", "given": "given", "assumed": assumed}
+    stayed = "" if facts["moved"] else "; their codes stay where they were"
     lines = [
         f"{facts['file']}: {size_text(facts['bytes'])}, {facts['ratio']:.2f} times smaller than the lossless "
         f"{size_text(facts['source_bytes'])}",
-        f"gaussians  {facts['rows']:.1%} are still there; the others were hardly seen",
+        f"gaussians  {facts['rows']:.1%} are still there; the others were hardly seen{stayed}",
         f"pictures   {facts['psnr_db']:.2f} dB to those of the lossless scene{held_out}{views}",
         f"loss       {facts['loss_db']:.3f} dB of {facts['fitted_db']:.2f} dB against footage "
         f"({source[facts['fitted_db_from']]}), by these pictures",
@@ -139,5 +142,10 @@ def _text(facts: Mapping[str, Any]) -> str:
         lines.append(
             f"footage    {after['psnr_db']:.3f} dB, SSIM {after['ssim']:.4f}; lossless {before['psnr_db']:.3f} dB, "
             f"{before['ssim']:.4f}; scored on cameras as packuv eval does"
+        )
+    if facts["unfollowed"]:
+        lines.append(
+            f"cameras    {', '.join(facts['unfollowed'])}: what they filmed is missing or unlike the scene, so no "
+            "codes moved towards it"
         )
     return "\n".join(lines)

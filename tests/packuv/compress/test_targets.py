@@ -60,10 +60,10 @@ def wrong(tmp_path_factory):
     return small_scene(tmp_path_factory.mktemp("wrong") / "scene.mkv", segments)
 
 
-def test_targets_are_filmed_pictures_and_lossless_ones_but_none_of_a_camera_that_is_held_out(lossless, footage):
+def test_targets_are_filmed_pictures_and_lossless_ones_but_none_of_a_camera_that_is_not_followed(lossless, footage):
     rng = np.random.default_rng(0)
     with open_scene(lossless) as scene:
-        targets = Targets(Views(footage.cameras[:2]), footage, scene.header.held_out, near=NEAR)
+        targets = Targets(Views(footage.cameras[:2]), footage, ("cam0", "cam1"), near=NEAR)
         found = [targets.draw(2, lambda: scene.gaussians(2), rng) for _ in range(60)]
     filmed = [target for target in found if target.response is not PLAIN]
     assert {target.camera.name for target in filmed} == {"cam0"}  # of the second there is no such frame
@@ -73,8 +73,8 @@ def test_targets_are_filmed_pictures_and_lossless_ones_but_none_of_a_camera_that
 
 def test_where_nothing_was_filmed_all_targets_are_lossless(lossless, footage):
     with open_scene(lossless) as scene:
-        for filmed, held_out in ((None, ()), (footage, footage.names)):
-            targets = Targets(Views(footage.cameras), filmed, held_out, near=NEAR)
+        for filmed, followed in ((None, footage.names), (footage, ())):
+            targets = Targets(Views(footage.cameras), filmed, followed, near=NEAR)
             found = targets.draw(0, lambda: scene.gaussians(0), np.random.default_rng(1))
             assert found.response is PLAIN
 
@@ -100,10 +100,12 @@ def test_footage_makes_better_pictures_than_the_scene_it_was_fitted_to(wrong, fo
     seeing = compress(wrong, tmp_path / "seeing.mkv", goal, footage=footage, iterations=60)
     with open_scene(wrong) as scene:
         judge = Judge(scene, footage)
-    lost = {name: judge.fitted_db - judge.errors(tmp_path / f"{name}.mkv").filmed_db for name in ("blind", "seeing")}
+    lost = {name: judge.errors(tmp_path / f"{name}.mkv").lost_db for name in ("blind", "seeing")}
     assert seeing.ratio >= 1.8 <= blind.ratio
     assert lost["seeing"] == pytest.approx(seeing.loss_db, abs=1e-9)
     assert lost["seeing"] < lost["blind"] - 0.3
+    assert seeing.moved
+    assert seeing.unfollowed == ()
     for name in ("blind", "seeing"):
         with open_scene(tmp_path / f"{name}.mkv") as scene:
             assert scene.header.extra["compression"]["filmed"] == (name == "seeing")
@@ -114,3 +116,14 @@ def test_footage_without_a_picture_to_judge_by_is_refused(lossless, footage, tmp
     with pytest.raises(ValueError, match="compared with what cam2 filmed, but the capture has no picture"):
         compress(lossless, tmp_path / "small.mkv", Goal(ratio=1.8), footage=blank)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_camera_that_films_something_else_is_not_followed(lossless, footage):
+    others = dict(footage._videos)
+    others["cam0"] = others["cam2"]
+    with open_scene(lossless) as scene:
+        judge = Judge(scene, Footage(others, footage.frames, footage.lenses))
+        assert judge.followed == ("cam1",)
+        assert judge.unfollowed == ("cam0",)
+        assert Judge(scene, footage).followed == ("cam0", "cam1")
+        assert Judge(scene).unfollowed == ()
