@@ -146,7 +146,7 @@ def evaluate_scene(
         fitted = [name for name in lenses if name not in header.held_out]
         names = tuple(cameras or header.held_out) or spread(fitted, options.fitted_cameras)
         if unknown := [name for name in names if name not in lenses]:
-            raise ValueError(f"the scene has no camera {', '.join(unknown)}; it has {', '.join(lenses)}")
+            raise ValueError(f"the scene has no camera {', '.join(unknown)}; it has {', '.join(lenses) or 'none'}")
         views = filmed_views(header, capture, names)
         silhouettes, doubtful = _silhouettes(capture, views)
         lpips = Lpips(weights) if weights else None
