@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,10 +61,9 @@ class Judge:
         self._options, self._arena = RasterOptions(near=self.near), Arena()
         self._truth = {(frame, name): picture for frame, name, picture in self._pictures(scene)}
         self._footage = footage
-        self.followed = () if footage is None else self._alike(scene, footage, {camera.name for camera in fitted})
-        """Fitted cameras whose footage shows what the scene does"""
-        names = () if footage is None else tuple(camera.name for camera in fitted)
-        self.unfollowed = tuple(name for name in names if name not in self.followed)
+        self.unfollowed = {} if footage is None else self._unlike(scene, footage, [camera.name for camera in fitted])
+        """Fitted cameras whose footage does not show what the scene does, and why that is thought of them"""
+        self.followed = tuple(camera.name for camera in fitted if camera.name not in self.unfollowed)
         self.filmed = footage is not None
         self._fitted = None if footage is None else self._filmed(scene, footage)
 
@@ -111,8 +110,9 @@ class Judge:
             )
         return {group: float(np.mean(levels)) for group, levels in found.items()}
 
-    def _alike(self, scene: Scene, footage: Footage, fitted: Collection[str]) -> tuple[str, ...]:
-        """Cameras of these whose first picture at one of the frames is about as near to the scene's as others' are."""
+    def _unlike(self, scene: Scene, footage: Footage, fitted: Sequence[str]) -> dict[str, str]:
+        """Cameras of these that have no picture at any of the frames, or are much further from the scene in the first
+        one than others are, and why."""
         levels = dict[str, float]()
         for frame in self.frames:
             gaussians = scene.gaussians(frame)
@@ -120,8 +120,11 @@ class Judge:
                 if name in fitted and name not in levels:
                     level = self._level(gaussians, footage, number, frame)
                     levels.update({} if level is None else {name: level})
-        least = np.median([*levels.values()]) - UNLIKE_DB if levels else 0.0
-        return tuple(name for name, level in levels.items() if level >= least)
+        middle = float(np.median([*levels.values()])) if levels else 0.0
+        at = f"no picture at frames {', '.join(map(str, self.frames))}"
+        unlike = {name: f"{level:.1f} dB to the scene, others {middle:.1f}" for name, level in levels.items()
+                  if level < middle - UNLIKE_DB}  # fmt: skip
+        return {name: unlike.get(name, at) for name in fitted if name in unlike or name not in levels}
 
     def _level(self, gaussians: Gaussians, footage: Footage, number: int, frame: int) -> float | None:
         """PSNR of a camera's picture, drawn as it would film it, dB; None where it has none."""

@@ -108,8 +108,8 @@ class Compressed:
     """Whether codes were moved; they stay where they were if that makes no better pictures"""
     imagined: bool
     """Whether the pictures are of imagined cameras, as nobody filmed the scene"""
-    unfollowed: tuple[str, ...]
-    """Fitted cameras towards whose footage, if any is given, no codes moved: it is missing, or shows something else"""
+    unfollowed: Mapping[str, str]
+    """Fitted cameras towards whose footage, if any is given, no codes moved, and why"""
 
     @property
     def ratio(self) -> float:

@@ -51,7 +51,7 @@ def command(arguments: argparse.Namespace) -> int:
         "rows": found.rows,
         "moved": found.moved,
         "imagined": found.imagined,
-        "unfollowed": list(found.unfollowed),
+        "unfollowed": dict(found.unfollowed),
     }
     if filmed:
         facts["filmed"] = {"lossless": filmed, "compressed": scores}
@@ -143,9 +143,5 @@ def _text(facts: Mapping[str, Any]) -> str:
             f"footage    {after['psnr_db']:.3f} dB, SSIM {after['ssim']:.4f}; lossless {before['psnr_db']:.3f} dB, "
             f"{before['ssim']:.4f}; scored on cameras as packuv eval does"
         )
-    if facts["unfollowed"]:
-        lines.append(
-            f"cameras    {', '.join(facts['unfollowed'])}: what they filmed is missing or unlike the scene, so no "
-            "codes moved towards it"
-        )
+    lines += [f"camera     {name}: no codes moved towards it: {why}" for name, why in facts["unfollowed"].items()]
     return "\n".join(lines)

@@ -105,7 +105,7 @@ def test_footage_makes_better_pictures_than_the_scene_it_was_fitted_to(wrong, fo
     assert lost["seeing"] == pytest.approx(seeing.loss_db, abs=1e-9)
     assert lost["seeing"] < lost["blind"] - 0.3
     assert seeing.moved
-    assert seeing.unfollowed == ()
+    assert not seeing.unfollowed
     for name in ("blind", "seeing"):
         with open_scene(tmp_path / f"{name}.mkv") as scene:
             assert scene.header.extra["compression"]["filmed"] == (name == "seeing")
@@ -124,6 +124,9 @@ def test_a_camera_that_films_something_else_is_not_followed(lossless, footage):
     with open_scene(lossless) as scene:
         judge = Judge(scene, Footage(others, footage.frames, footage.lenses))
         assert judge.followed == ("cam1",)
-        assert judge.unfollowed == ("cam0",)
+        assert [*judge.unfollowed] == ["cam0"]
+        assert "dB to the scene, others" in judge.unfollowed["cam0"]
         assert Judge(scene, footage).followed == ("cam0", "cam1")
-        assert Judge(scene).unfollowed == ()
+        assert not Judge(scene).unfollowed
+        without = Footage(others, np.where(np.arange(3) == 1, -1, footage.frames), footage.lenses)
+        assert "no picture at frames" in Judge(scene, without).unfollowed["cam1"]
