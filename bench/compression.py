@@ -78,7 +78,7 @@ class _Table:
         """The same of the rows that are worth their bits, moved to make up for the others."""
         started = time.perf_counter()
         judge, ticks = self._judge, Ticks(no_progress, 1)
-        targets = Targets(judge.views, None, (), near=judge.near)
+        targets = Targets(judge.views, near=judge.near)
         rows = Rows(self._scene, targets, self._folder, near=judge.near, seed=0, ticks=ticks)
         paths = rows.coarse(noise, steps, usual_iterations(len(self.segments)))
         facts = {"rows": rows.kept / rows.count, "seconds": round(time.perf_counter() - started, 1)}

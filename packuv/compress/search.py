@@ -12,7 +12,7 @@ from typing import Any
 
 from packuv.compress.brief import brief
 from packuv.compress.imagined import IMAGINED
-from packuv.compress.judge import EXACT, Judge
+from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
 from packuv.compress.sensitivity import sensitivity
 from packuv.compress.steps import Steps
@@ -33,6 +33,8 @@ AGAIN, CORRECTIONS = 4, 3
 FINEST = 1e-10
 """Noise of the finest steps that are tried, mean squared error of each kind of code"""
 COARSEST = 0.03
+EXACT = 1e-12
+"""Mean squared error of pictures that are told apart from equal ones, which have no PSNR"""
 LONGEST = {"psnr_db": -100.123, "psnr_held_out_db": -100.123, "loss_db": -100.1234}
 """Figures that take as many characters as any, in the header of trials"""
 RATIO_TOLERANCE, LOSS_TOLERANCE = 0.02, 0.03
@@ -174,7 +176,7 @@ class _Work:
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, near=near, seed=seed, ticks=ticks)
         if not self._sensitivity.any():
             raise ValueError(f"{scene.path} must show something to be compressed, but its cameras see nothing")
-        targets = Targets(self._judge.views, footage, self._judge.followed, near=near)
+        targets = Targets(self._judge.views, self._judge.filmed, near=near)
         self._rows = Rows(scene, targets, folder, near=near, seed=seed, ticks=ticks)
         self._source, self._source_bytes = _digest(scene), scene.path.stat().st_size
         self._sound = scene.sound()
@@ -274,7 +276,7 @@ class _Work:
         imagined = self._judge.imagined is not None
         return Compressed(
             self._source_bytes, size, psnr_db, unseen_db, loss_db, noise, steps, rows, iterations > 0, imagined,
-            self._judge.unfollowed,
+            self._judge.filmed.unfollowed if self._judge.filmed else {},
         )  # fmt: skip
 
     def _encode(
@@ -296,7 +298,7 @@ class _Work:
             "position_multiple": steps.multiple,
             "attribute_steps": steps.attribute.tolist(),
             "fitted_db": self._goal.fitted_db,
-            "filmed": self._judge.filmed,
+            "filmed": self._judge.filmed is not None,
             "cameras": [camera.name for camera in self._judge.cameras],
             "frames": list(self._judge.frames),
             **({IMAGINED: self._judge.imagined} if self._judge.imagined else {}),

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from packuv.camera import PinholeCamera
+from packuv.compress.filmed import Filmed
 from packuv.compress.views import Views
 from packuv.footage import Response
-from packuv.footage import Views as Footage
 from packuv.footage.response import PLAIN
 from packuv.gaussians.floats import Gaussians
 from packuv.raster import Arena, RasterOptions, render
@@ -36,19 +36,19 @@ class Target:
 class Targets:
     """Pictures by chance."""
 
-    def __init__(self, views: Views, footage: Footage | None, followed: Collection[str], *, near: float) -> None:
-        """Instant i of `footage` is frame i of the scene; cameras that are not `followed` set no targets."""
-        self.views, self._footage = views, footage
-        names = footage.names if footage else ()
-        self._filming = [number for number, name in enumerate(names) if name in followed]
+    def __init__(self, views: Views, filmed: Filmed | None = None, *, near: float) -> None:
+        self._filmed = filmed
+        self.views = views
+        """From which the lossless scene is looked at"""
         self._options, self._arena = RasterOptions(near=near), Arena()
 
     def draw(self, frame: int, lossless: Callable[[], Gaussians], rng: np.random.Generator) -> Target:
         """One of a frame of the scene, whose Gaussians `lossless` tells."""
-        if self._footage and self._filming and rng.random() < FILMED:
-            number = self._filming[rng.integers(len(self._filming))]
-            if (filmed := self._footage.filmed(number, frame)) is not None:
-                return Target(self._footage.cameras[number], filmed, self._footage.response(number, frame))
+        if self._filmed and self._filmed.followed and rng.random() < FILMED:
+            footage, followed = self._filmed.footage, self._filmed.followed
+            number = footage.names.index(followed[rng.integers(len(followed))])
+            if (picture := footage.filmed(number, frame)) is not None:
+                return Target(footage.cameras[number], picture, footage.response(number, frame))
         camera = self.views.draw(rng)
         drawn = render(lossless(), camera, options=self._options, arena=self._arena).colour
         return Target(camera, np.clip(drawn, 0, 1), PLAIN)

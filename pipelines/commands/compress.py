@@ -128,6 +128,7 @@ def _text(facts: Mapping[str, Any]) -> str:
     views = ", from views that were imagined, for no camera filmed it" if facts["imagined"] else ""
     assumed = "assumed; there is none" if facts["imagined"] else "assumed; --capture measures it"
     source = {"capture": "measured", "given": "given", "assumed": assumed}
+    larger = ", the larger of held-out and of fitted cameras" if "filmed" in facts and unseen is not None else ""
     stayed = "" if facts["moved"] else "; their codes stay where they were"
     lines = [
         f"{facts['file']}: {size_text(facts['bytes'])}, {facts['ratio']:.2f} times smaller than the lossless "
@@ -135,7 +136,7 @@ def _text(facts: Mapping[str, Any]) -> str:
         f"gaussians  {facts['rows']:.1%} are still there; the others were hardly seen{stayed}",
         f"pictures   {facts['psnr_db']:.2f} dB to those of the lossless scene{held_out}{views}",
         f"loss       {facts['loss_db']:.3f} dB of {facts['fitted_db']:.2f} dB against footage "
-        f"({source[facts['fitted_db_from']]}), by these pictures",
+        f"({source[facts['fitted_db_from']]}), by these pictures{larger}",
     ]
     if "filmed" in facts:
         before, after = facts["filmed"]["lossless"], facts["filmed"]["compressed"]

@@ -125,7 +125,7 @@ def test_tuning_makes_up_for_who_is_left_out_and_leaves_others_alone(cameras):
         COARSE,
         COARSE.quantizer(quantizer),
         lambda frame: quantizer.decode(lossless.frame(frame)),
-        Targets(Views(cameras), None, (), near=NEAR),
+        Targets(Views(cameras), near=NEAR),
         np.zeros((len(free), COLUMNS)),
         free=free,
         iterations=40,
@@ -140,7 +140,7 @@ def test_tuning_makes_up_for_who_is_left_out_and_leaves_others_alone(cameras):
 
 def test_keys_of_equal_rows_stay_equal_when_they_are_tuned(cameras, tmp_path):
     with open_scene(small_scene(tmp_path / "scene.mkv")) as scene:
-        targets = Targets(Views(cameras), None, (), near=NEAR)
+        targets = Targets(Views(cameras), near=NEAR)
         rows = Rows(scene, targets, tmp_path, near=NEAR, seed=0, ticks=ticks())
         first, second = (Segment.load(path) for path in rows.coarse(1e-7, COARSE, 10))
     assert 0 < rows.kept < rows.count == 2 * ROWS

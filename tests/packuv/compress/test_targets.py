@@ -60,10 +60,10 @@ def wrong(tmp_path_factory):
     return small_scene(tmp_path_factory.mktemp("wrong") / "scene.mkv", segments)
 
 
-def test_targets_are_filmed_pictures_and_lossless_ones_but_none_of_a_camera_that_is_not_followed(lossless, footage):
+def test_targets_are_filmed_pictures_of_fitted_cameras_and_lossless_ones(lossless, footage):
     rng = np.random.default_rng(0)
     with open_scene(lossless) as scene:
-        targets = Targets(Views(footage.cameras[:2]), footage, ("cam0", "cam1"), near=NEAR)
+        targets = Targets(Views(footage.cameras[:2]), Judge(scene, footage).filmed, near=NEAR)
         found = [targets.draw(2, lambda: scene.gaussians(2), rng) for _ in range(60)]
     filmed = [target for target in found if target.response is not PLAIN]
     assert {target.camera.name for target in filmed} == {"cam0"}  # of the second there is no such frame
@@ -73,10 +73,8 @@ def test_targets_are_filmed_pictures_and_lossless_ones_but_none_of_a_camera_that
 
 def test_where_nothing_was_filmed_all_targets_are_lossless(lossless, footage):
     with open_scene(lossless) as scene:
-        for filmed, followed in ((None, footage.names), (footage, ())):
-            targets = Targets(Views(footage.cameras), filmed, followed, near=NEAR)
-            found = targets.draw(0, lambda: scene.gaussians(0), np.random.default_rng(1))
-            assert found.response is PLAIN
+        targets = Targets(Views(footage.cameras), near=NEAR)
+        assert targets.draw(0, lambda: scene.gaussians(0), np.random.default_rng(1)).response is PLAIN
 
 
 def test_a_pull_is_the_derivative_of_half_the_squared_error(footage):
@@ -122,11 +120,20 @@ def test_a_camera_that_films_something_else_is_not_followed(lossless, footage):
     others = dict(footage._videos)
     others["cam0"] = others["cam2"]
     with open_scene(lossless) as scene:
-        judge = Judge(scene, Footage(others, footage.frames, footage.lenses))
-        assert judge.followed == ("cam1",)
-        assert [*judge.unfollowed] == ["cam0"]
-        assert "dB to the scene, others" in judge.unfollowed["cam0"]
-        assert Judge(scene, footage).followed == ("cam0", "cam1")
-        assert not Judge(scene).unfollowed
+        found = Judge(scene, Footage(others, footage.frames, footage.lenses)).filmed
+        assert found.followed == ("cam1",)
+        assert [*found.unfollowed] == ["cam0"]
+        assert "dB to the scene, others" in found.unfollowed["cam0"]
+        assert not Judge(scene, footage).filmed.unfollowed
         without = Footage(others, np.where(np.arange(3) == 1, -1, footage.frames), footage.lenses)
-        assert "no picture at frames" in Judge(scene, without).unfollowed["cam1"]
+        assert Judge(scene, without).filmed.unfollowed == {"cam1": "no picture at frames 1, 3, 5"}
+        assert Judge(scene).filmed is None
+
+
+def test_the_larger_loss_of_held_out_and_of_fitted_cameras_counts(lossless, wrong, footage):
+    with open_scene(lossless) as scene, open_scene(wrong) as other:
+        filmed = Judge(scene, footage).filmed
+        right, moved = filmed._levels(scene), filmed._levels(other)
+        lost = [right[group] - moved[group] for group in (True, False)]
+        assert filmed.lost_db(other) == max(lost)
+    assert min(lost) > 1
