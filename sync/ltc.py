@@ -19,7 +19,7 @@ from sync.audio import Track, sound_tracks
 from sync.timecode import NANOSECONDS, frame_to_label, labels_to_ns
 from sync.tree import whole_file
 
-KEPT = 1
+KEPT = 2
 """Version of the files of what was heard"""
 RATE = 48_000
 """Samples a second that are read"""
@@ -41,6 +41,8 @@ APART_S = 1.5
 """Between the labels of two channels, which are compared without their rate, for them to disagree"""
 HYSTERESIS, QUIET = 0.1, 0.2
 """Of the wave's height about there, which noise does not cross; and of its greatest height, below which it is silent"""
+STEEP = 2
+"""Samples within which a wave turns; between others it is silent, and turns where it is heard again"""
 BITS = 80
 SYNC = np.array([0, 0, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0, 1], np.uint8)
 """The last bits of a frame"""
@@ -248,8 +250,8 @@ def _turns(samples: np.ndarray) -> np.ndarray:
         return np.zeros(0)
     turned = np.flatnonzero(np.diff(np.sign(wave[sure])))
     before, after = sure[turned], sure[turned + 1]
-    turns: np.ndarray = before + wave[before] / (wave[before] - wave[after]) * (after - before)
-    return turns
+    between = before + wave[before] / (wave[before] - wave[after]) * (after - before)
+    return np.where(after - before > STEEP, after - 0.5, between)
 
 
 def _without_hum(samples: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sync import ltc
@@ -39,6 +39,7 @@ def labels_from(number: int, count: int, rate: Fraction, *, drop: bool = False) 
     gain=st.sampled_from([1.0, -0.02, 0.3]),
     offset=st.sampled_from([0.0, 0.1]),
 )
+@example(rate_drop=(RATES[0], False), start=0.0, lead_s=0.125, gain=1.0, offset=0.0)  # begins in silence
 def test_what_is_written_is_heard(rate_drop, start, lead_s, gain, offset):
     (rate, drop), count = rate_drop, 40
     first = int(start * (frames_per_day(rate, drop_frame=drop) - 1))
