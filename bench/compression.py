@@ -39,7 +39,7 @@ from packuv.gaussians.codes import OPACITY, REST, Codes, attribute_count
 from packuv.gaussians.segment import Segment
 from packuv.metrics import decibels, ssim
 from packuv.progress import Ticks, no_progress
-from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, Tolerance, write_scene
+from packuv.scene import TOLERANCES, EncodeOptions, Quality, Scene, Tolerance, open_scene, write_scene
 
 KINDS = {"position": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 9), "opacity": slice(9, 10)}
 """Of the 3 + A kinds of codes; colours are the rest"""
@@ -126,10 +126,11 @@ def distortion(judge: Judge, file: Path) -> dict[str, float | None]:
     """Of a scene file's pictures."""
     errors: dict[bool, list[float]] = {False: [], True: []}
     alike = []
-    for unseen, picture, truth in judge.pairs(file):
-        errors[unseen].append(float(np.square(picture - truth, dtype=np.float64).mean()))
-        if unseen:
-            alike.append(ssim(picture, truth))
+    with open_scene(file) as scene:
+        for unseen, picture, truth in judge.pairs(scene):
+            errors[unseen].append(float(np.square(picture - truth, dtype=np.float64).mean()))
+            if unseen:
+                alike.append(ssim(picture, truth))
     known = {"psnr_db": errors[False], "psnr_unseen_db": errors[True]}
     levels = {name: _level(values) for name, values in known.items()}
     return {**levels, "ssim_unseen": float(np.mean(alike)) if alike else None}

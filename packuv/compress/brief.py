@@ -12,10 +12,8 @@ from packuv.bounds import MOST_NUMBER
 from packuv.camera import PinholeCamera
 from packuv.footage.lens import LensCamera, abridged, unabridged
 from packuv.scene import SceneHeader
-from packuv.scene.header import COMPRESSION
+from packuv.scene.header import COMPRESSION, LENSES
 
-LENSES = "lenses"
-"""Name of what `extra` says of the cameras as they film"""
 SHORT = ("near", "scene_radius", "up", COMPRESSION)
 """What else in `extra` is told as briefly; not the quantizer, which decodes codes"""
 MOST_PX = 1e-3

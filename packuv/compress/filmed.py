@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
 from packuv.footage import Views as Footage
-from packuv.gaussians.floats import Gaussians
 from packuv.metrics import psnr
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene
@@ -57,24 +56,17 @@ class Filmed:
     def _levels(self, scene: Scene) -> dict[bool, float]:
         """PSNR, mean over pictures, of judged cameras that are held out (True), and of others."""
         found = dict[bool, list[float]]()
-        for frame in self._frames:
-            gaussians = scene.gaussians(frame)
-            for number, name in enumerate(self.footage.names):
-                level = self._level(gaussians, number, frame) if name in self._judged else None
-                if level is not None:
-                    found.setdefault(name in self._held_out, []).append(level)
+        for name, level in self._measured(scene, self._judged):
+            found.setdefault(name in self._held_out, []).append(level)
         return {group: float(np.mean(levels)) for group, levels in found.items()}
 
     def _unlike(self, scene: Scene, fitted: Sequence[str]) -> dict[str, str]:
         """Cameras of these that have no picture at any of the frames, or are much further from the scene in the first
         one than others are, and why."""
-        levels = dict[str, float]()
-        for frame in self._frames:
-            gaussians = scene.gaussians(frame)
-            for number, name in enumerate(self.footage.names):
-                level = self._level(gaussians, number, frame) if name in fitted and name not in levels else None
-                if level is not None:
-                    levels[name] = level
+        levels, unknown = dict[str, float](), {*fitted}
+        for name, level in self._measured(scene, unknown):
+            levels[name] = level
+            unknown.discard(name)
         middle = float(np.median([*levels.values()])) if levels else 0.0
         unlike = {name: f"{level:.1f} dB to the scene, others {middle:.1f}" for name, level in levels.items()
                   if level < middle - UNLIKE_DB}  # fmt: skip
@@ -85,9 +77,12 @@ class Filmed:
     def _at(self) -> str:
         return f"at frame{'s' if len(self._frames) > 1 else ''} {', '.join(map(str, self._frames))}"
 
-    def _level(self, gaussians: Gaussians, number: int, frame: int) -> float | None:
-        """PSNR of a camera's picture, dB; None where it has none."""
-        if (filmed := self.footage.filmed(number, frame)) is None:
-            return None
-        drawn = render(gaussians, self.footage.cameras[number], options=self._options, arena=self._arena).colour
-        return min(psnr(self.footage.response(number, frame).shown(drawn), filmed), EXACT_DB)
+    def _measured(self, scene: Scene, wanted: Collection[str]) -> Iterator[tuple[str, float]]:
+        """Camera and PSNR, dB, of each picture of those that are still wanted when its turn comes."""
+        for frame in self._frames:
+            gaussians = scene.gaussians(frame)
+            for number, camera in enumerate(self.footage.cameras):
+                if camera.name in wanted and (filmed := self.footage.filmed(number, frame)) is not None:
+                    drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
+                    shown = self.footage.response(number, frame).shown(drawn)
+                    yield camera.name, min(psnr(shown, filmed), EXACT_DB)

@@ -61,21 +61,21 @@ class Judge:
 
     def errors(self, path: Path) -> Errors:
         """Of a scene file."""
-        wrong = [
-            (unseen, float(np.square(picture - truth, dtype=np.float64).mean()))
-            for unseen, picture, truth in self.pairs(path)
-        ]
-        others = [error for unseen, error in wrong if unseen]
-        mean, unseen = float(np.mean([error for _, error in wrong])), float(np.mean(others)) if others else None
         with open_scene(path) as scene:
+            wrong = [
+                (unseen, float(np.square(picture - truth, dtype=np.float64).mean()))
+                for unseen, picture, truth in self.pairs(scene)
+            ]
             lost_db = self.filmed.lost_db(scene) if self.filmed else None
-        return Errors(mean, unseen, lost_db)
+        others = [error for unseen, error in wrong if unseen]
+        return Errors(
+            float(np.mean([error for _, error in wrong])), float(np.mean(others)) if others else None, lost_db
+        )
 
-    def pairs(self, path: Path) -> Iterator[tuple[bool, np.ndarray, np.ndarray]]:
-        """Whether nothing was learned from the camera, a scene file's picture and the true one, float32 [3, H, W]."""
-        with open_scene(path) as scene:
-            for frame, name, picture in self._pictures(scene):
-                yield name in self._unseen, picture, self._truth[frame, name]
+    def pairs(self, scene: Scene) -> Iterator[tuple[bool, np.ndarray, np.ndarray]]:
+        """Whether nothing was learned from the camera, a scene's picture and the true one, float32 [3, H, W]."""
+        for frame, name, picture in self._pictures(scene):
+            yield name in self._unseen, picture, self._truth[frame, name]
 
     def _pictures(self, scene: Scene) -> Iterator[tuple[int, str, np.ndarray]]:
         """Frame, camera, and float32 [3, H, W] as a display shows it in the light of the instant."""

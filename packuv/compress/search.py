@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from packuv.compress.brief import brief
+from packuv.compress.filmed import EXACT_DB
 from packuv.compress.imagined import IMAGINED
 from packuv.compress.judge import Judge
 from packuv.compress.rows import Rows
@@ -33,8 +34,6 @@ AGAIN, CORRECTIONS = 4, 3
 FINEST = 1e-10
 """Noise of the finest steps that are tried, mean squared error of each kind of code"""
 COARSEST = 0.03
-EXACT = 1e-12
-"""Mean squared error of pictures that are told apart from equal ones, which have no PSNR"""
 LONGEST = {"psnr_db": -100.123, "psnr_held_out_db": -100.123, "loss_db": -100.1234}
 """Figures that take as many characters as any, in the header of trials"""
 RATIO_TOLERANCE, LOSS_TOLERANCE = 0.02, 0.03
@@ -268,8 +267,8 @@ class _Work:
         size = self._encode(path, segments, steps, rows, LONGEST)
         errors = self._judge.errors(path)
         self._ticks.advance(self._pictures)
-        psnr_db = decibels(max(errors.mean, EXACT))
-        unseen_db = None if errors.unseen is None else decibels(max(errors.unseen, EXACT))
+        psnr_db = min(decibels(errors.mean), EXACT_DB)
+        unseen_db = None if errors.unseen is None else min(decibels(errors.unseen), EXACT_DB)
         loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)
         if errors.lost_db is not None:
             loss_db = errors.lost_db

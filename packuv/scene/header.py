@@ -36,6 +36,8 @@ COMPRESSION = "compression"
 """Name of what `extra` says of a scene whose codes are coarser than those of the lossless one that it was made from"""
 ADOPTED = "adopted"
 """Name of what `extra` says of a scene that was made of splat files"""
+LENSES = "lenses"
+"""Name of what `extra` says of the cameras as they film"""
 LIGHT_STEPS = 100_000
 """Light is stored in steps of 1 / LIGHT_STEPS, a thousandth of a percent"""
 

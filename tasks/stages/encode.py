@@ -18,6 +18,7 @@ from packuv.footage.light import packed
 from packuv.gaussians.codes import OPACITY, Codes
 from packuv.gaussians.segment import Segment
 from packuv.scene import EncodeOptions, SceneHeader, Sound, Tolerance, open_scene, write_scene
+from packuv.scene.header import LENSES
 from packuv.scene.sharing import stored_segments
 from packuv.scene.sound import RATE
 from sync.align import SyncReport
@@ -150,7 +151,7 @@ def scene_header(footage: Footage, held_out: tuple[str, ...], key: KeyState, lig
             # Absent where nobody knows it, likewise below, so that scenes keep their bytes.
             **({"up": list(rig.up)} if rig.up else {}),
             "max_width": footage.take.pictures.max_width,
-            "lenses": abridged(lenses, cameras),
+            LENSES: abridged(lenses, cameras),
             # Absent where tags decide, so that scenes of such captures keep their bytes.
             **({"transfer": str(transfer)} if transfer else {}),
             **({"exposure": {name: packed(own) for name, own in light.exposures.items()}} if light else {}),

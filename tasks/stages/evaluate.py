@@ -22,6 +22,7 @@ from packuv.motion import MotionOptions, measure_motion
 from packuv.motion.foreground import compare_masks
 from packuv.progress import Progress
 from packuv.scene import SceneHeader, open_scene
+from packuv.scene.header import LENSES
 from packuv.score import Likeness, Score, glance, score, segment_starts, spread, summary, write_pictures, write_table
 from sync.align import AlignOptions, FrameGroups, align
 from sync.capture import find_capture, load_timecodes, probe_capture
@@ -198,12 +199,12 @@ def _silhouettes(capture: Path, views: Views) -> tuple[Silhouettes | None, dict[
 def _lenses(header: SceneHeader) -> dict[str, LensCamera]:
     """The scene's cameras as they film, by name. Raises ValueError where a scene does not tell, as imported ones do
     not."""
-    if "lenses" not in header.extra:
+    if LENSES not in header.extra:
         raise ValueError(
             "what was filmed can be compared with a scene that says how its cameras film (extra.lenses), but this one "
             "does not, as imported ones; leave the capture out"
         )
-    return unabridged(header.extra["lenses"], header.cameras, "extra: lenses")
+    return unabridged(header.extra[LENSES], header.cameras, f"extra: {LENSES}")
 
 
 def _light(header: SceneHeader) -> Light:
