@@ -548,12 +548,12 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def spread(names: Sequence[Item], count: int) -> tuple[Item, ...]:
-    """`count` of the names at equal distances; all of them if there are fewer.
+def spread(items: Sequence[Item], count: int) -> tuple[Item, ...]:
+    """`count` of the items at equal distances; all of them if there are fewer.
 
     >>> spread(["a", "b", "c", "d", "e", "f"], 3)
     ('b', 'd', 'f')
     """
-    if count >= len(names):
-        return tuple(names)
-    return tuple(names[(2 * place + 1) * len(names) // (2 * count)] for place in range(count))
+    if count >= len(items):
+        return tuple(items)
+    return tuple(items[(2 * place + 1) * len(items) // (2 * count)] for place in range(count))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from packuv.compress.views import Views
 from packuv.footage import Views as Footage
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene, open_scene
+from packuv.score import spread
 
 FRAMES, CAMERAS = 3, 12
 """Of which pictures tell distortion, at most, spread evenly: 36 of them differ from all by some tenths of a decibel"""
@@ -41,13 +41,13 @@ class Judge:
         header = looked_at(scene)
         held_out = [camera for camera in header.cameras if camera.name in header.held_out]
         fitted = [camera for camera in header.cameras if camera.name not in header.held_out]
-        unseen = _spread(held_out, CAMERAS // 3 if fitted else CAMERAS)
-        self.learned = _spread(fitted, CAMERAS - len(unseen)) or unseen
+        unseen = spread(held_out, CAMERAS // 3 if fitted else CAMERAS)
+        self.learned = spread(fitted, CAMERAS - len(unseen)) or unseen
         """Cameras from which sensitivity is learned"""
         self.views = Views(fitted or unseen, filmed=header is scene.header)
         """From which rows are weighed and tuned"""
-        self.cameras = tuple(self.learned) + tuple(camera for camera in unseen if camera not in self.learned)
-        self.frames = tuple(_spread(range(len(scene)), FRAMES))
+        self.cameras = self.learned + tuple(camera for camera in unseen if camera not in self.learned)
+        self.frames = spread(range(len(scene)), FRAMES)
         self._unseen = {camera.name for camera in self.cameras} - {camera.name for camera in self.learned}
         self.near = header.near
         self.imagined = header.extra.get(IMAGINED)
@@ -84,10 +84,3 @@ class Judge:
             for camera in self.cameras:
                 drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
                 yield frame, camera.name, np.clip(lit(drawn, scene.light(frame)), 0, 1).astype(np.float32)
-
-
-def _spread(items: Sequence[Any], count: int) -> list[Any]:
-    """`count` of the items at equal distances; all of them if there are fewer."""
-    if count >= len(items):
-        return list(items)
-    return [items[(2 * place + 1) * len(items) // (2 * count)] for place in range(count)]

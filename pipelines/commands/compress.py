@@ -16,6 +16,7 @@ from pipelines.disk import size_text
 if TYPE_CHECKING:
     from packuv.compress import Compressed, Goal
     from packuv.footage import Views as Footage
+    from tasks.stages.evaluate import Matched
 
 SEARCHES = 4
 """Of which each aims at less than the one before, where footage shows a loss above what was asked for"""
@@ -28,14 +29,13 @@ def command(arguments: argparse.Namespace) -> int:
     from packuv.compress import Goal
 
     check_place(arguments.output)
-    if arguments.capture:
-        _check_filmed(arguments.scene)
-    filmed = _scores(arguments, arguments.scene) if arguments.capture else None
+    matched = _matched(arguments.scene, arguments.capture) if arguments.capture else None
+    filmed = _scores(arguments, arguments.scene, matched) if matched else None
     fitted = {"fitted_db": filmed["psnr_db"]} if filmed else {}
     if arguments.fitted_db is not None:
         fitted = {"fitted_db": arguments.fitted_db}
     goal = Goal(arguments.ratio, arguments.loss_db, **fitted)
-    found, scores = _search(arguments, goal, filmed)
+    found, scores = _search(arguments, goal, matched, filmed)
     facts: dict[str, Any] = {
         "file": str(arguments.output),
         "bytes": found.bytes,
@@ -60,7 +60,7 @@ def command(arguments: argparse.Namespace) -> int:
 
 
 def _search(
-    arguments: argparse.Namespace, goal: Goal, filmed: Mapping[str, float] | None
+    arguments: argparse.Namespace, goal: Goal, matched: Matched | None, filmed: Mapping[str, float] | None
 ) -> tuple[Compressed, dict[str, float] | None]:
     """Compress; with footage, so that the loss which it shows is what was asked for at most. Also scores of the result.
 
@@ -68,7 +68,7 @@ def _search(
     """
     from packuv.compress import compress
 
-    footage = _footage(arguments.scene, arguments.capture) if arguments.capture else None
+    footage = _footage(arguments.scene, matched) if matched else None
     asked, lost, place = goal.loss_db, 0.0, partial_path(arguments.output, ".mkv")
     try:
         for number in range(SEARCHES):
@@ -80,7 +80,7 @@ def _search(
                 if number:  # no steps are so fine
                     break
                 raise
-            scores = _scores(arguments, place) if filmed else None
+            scores = _scores(arguments, place, matched) if matched else None
             lost = filmed["psnr_db"] - scores["psnr_db"] if filmed and scores else 0.0
             if asked is None or goal.loss_db is None or lost <= asked:
                 place.replace(arguments.output)
@@ -94,31 +94,34 @@ def _search(
     )
 
 
-def _check_filmed(path: Path) -> None:
+def _matched(path: Path, capture: Path) -> Matched:
+    """Which pictures of the capture are the scene's. Raises ValueError for a scene that no camera filmed."""
     from packuv.scene import open_scene
+    from tasks.stages.evaluate import match
 
     with open_scene(path) as scene:
         if not scene.header.filmed:
             raise ValueError(
                 f"a capture scores scenes that its cameras filmed, but no camera filmed {path}; leave out --capture"
             )
+        return match(scene.header, capture)
 
 
-def _footage(scene: Path, capture: Path) -> Footage:
+def _footage(scene: Path, matched: Matched) -> Footage:
     """What the scene's cameras filmed, frame by frame."""
     from packuv.scene import open_scene
     from tasks.stages.evaluate import filmed_views
 
     with open_scene(scene) as opened:
-        return filmed_views(opened.header, capture)
+        return filmed_views(opened.header, matched)
 
 
-def _scores(arguments: argparse.Namespace, scene: Path) -> dict[str, float]:
+def _scores(arguments: argparse.Namespace, scene: Path, matched: Matched) -> dict[str, float]:
     """PSNR and SSIM against what was filmed, renders being as the cameras would film them."""
     from tasks.stages.evaluate import EvaluateOptions, evaluate_scene
 
     with shown(arguments, "evaluate") as progress:
-        mean = evaluate_scene(scene, arguments.capture, None, EvaluateOptions(), progress)["mean"]
+        mean = evaluate_scene(scene, matched, None, EvaluateOptions(), progress)["mean"]
     return {"psnr_db": mean["psnr_calibrated_db"], "ssim": mean["ssim_calibrated"]}
 
 

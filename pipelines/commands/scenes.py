@@ -254,10 +254,10 @@ def _heard(header: SceneHeader, capture: Path, path: CameraPath) -> tuple[str, n
     from sync.capture import find_capture
     from sync.content.sound import listen_to_one
     from tasks.stages.encode import in_turn
-    from tasks.stages.evaluate import filmed_views, known_cameras
+    from tasks.stages.evaluate import filmed_views, known_cameras, match
 
     names = known_cameras(header)
-    frames = filmed_views(header, capture, names).frames  # [T, C], -1 where a camera has none
+    frames = filmed_views(header, match(header, capture), names).frames  # [T, C], -1 where a camera has none
     first = min(min(view.frame for view in path.views), len(frames) - 1)
     asked = in_turn(dict(zip(names, map(int, frames[first]), strict=True)), header)
     return listen_to_one(find_capture(capture).videos, asked, _span(header, path)[1], SOUND_RATE) or ("", None)
@@ -407,12 +407,11 @@ def filmed(header: SceneHeader, capture: Path) -> Filmed:
     import numpy as np
 
     from pipelines.filmed import Filmed
-    from tasks.stages.evaluate import filmed_views, known_cameras
+    from tasks.stages.evaluate import filmed_views, known_cameras, match
 
     cameras = known_cameras(header)
-    return Filmed(
-        cameras, lambda: filmed_views(header, capture, cameras), np.arange(len(header.times_ns)), header.light
-    )
+    instants = np.arange(len(header.times_ns))
+    return Filmed(cameras, lambda: filmed_views(header, match(header, capture), cameras), instants, header.light)
 
 
 def _capture_of(folder: Path) -> Path | None:

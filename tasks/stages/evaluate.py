@@ -40,6 +40,8 @@ from tasks.stages.synchronize import STARTS_NS, begun
 METRICS, TABLE, PICTURES = "metrics.json", "metrics.arrow", "pictures"
 FITTED = "fitted"
 """Of the metrics: what fitted cameras score beside unseen ones"""
+SAME_NS = 200_000
+"""By how much the times of one instant may differ: sound tells them to 0.1 ms, now as when the scene was made"""
 GLANCE_FRAMES = 8
 """At which fitted cameras are scored beside unseen ones, spread over the scene"""
 
@@ -121,9 +123,19 @@ def fitted_scores(metrics: Mapping[str, Any]) -> tuple[FrameScore, ...]:
     )
 
 
+@dataclass(frozen=True)
+class Matched:
+    """A capture folder, and which pictures it has of the instants of a scene."""
+
+    capture: Path
+    cameras: tuple[str, ...]
+    frames: np.ndarray
+    """int [T, C], by the scene's frame and the camera"""
+
+
 def evaluate_scene(
     scene: Path,
-    capture: Path,
+    capture: Path | Matched,
     cameras: Sequence[str] | None,
     options: EvaluateOptions,
     progress: Progress,
@@ -133,10 +145,9 @@ def evaluate_scene(
     """Score a scene file against a capture folder, without a store; the summary that `evaluate` writes. `device`, cpu
     or cuda, draws.
 
-    The frames of the capture are matched again as the scene's header says, and found by their times. Raises
-    ValueError for a camera that the scene does not know, or a capture that did not film the scene's instants; where
-    weights for LPIPS are named, but it cannot be measured with them. Where masks do not fit what moves, they are not
-    used, and `doubtful_masks` says why, by camera.
+    The frames of a capture folder are matched again, see `match`. Raises ValueError for a camera that the scene does
+    not know, or a capture that did not film the scene's instants; where weights for LPIPS are named, but it cannot be
+    measured with them. Where masks do not fit what moves, they are not used, and `doubtful_masks` says why, by camera.
     """
     weights = Path(options.lpips_weights) if options.lpips_weights else None
     if weights and (why := lacking(weights)):
@@ -148,8 +159,9 @@ def evaluate_scene(
         names = tuple(cameras or header.held_out) or spread(fitted, options.fitted_cameras)
         if unknown := [name for name in names if name not in lenses]:
             raise ValueError(f"the scene has no camera {', '.join(unknown)}; it has {', '.join(lenses) or 'none'}")
-        views = filmed_views(header, capture, names)
-        silhouettes, doubtful = _silhouettes(capture, views)
+        matched = capture if isinstance(capture, Matched) else match(header, capture)
+        views = filmed_views(header, matched, names)
+        silhouettes, doubtful = _silhouettes(matched.capture, views)
         lpips = Lpips(weights) if weights else None
         scores = score(opened, views, progress, lpips=lpips, silhouettes=silhouettes, device=device)
         facts = summary(scores, frames=len(opened), size_bytes=scene.stat().st_size, borders=segment_starts(opened))
@@ -161,18 +173,24 @@ def known_cameras(header: SceneHeader) -> tuple[str, ...]:
     return tuple(_lenses(header))
 
 
-def filmed_views(header: SceneHeader, capture: Path, cameras: Sequence[str] | None = None) -> Views:
-    """What these cameras of a capture folder filmed at the instants of a scene, frame by frame; None: all that both
-    have. Raises ValueError for a capture that did not film them."""
-    groups, lenses = _matched(capture, header.sync), _lenses(header)
-    rows = _rows(groups, header.times_ns)
-    cameras = [name for name in lenses if name in groups.cameras] if cameras is None else cameras
-    if unknown := [name for name in cameras if name not in groups.cameras]:
-        raise ValueError(f"{capture} has no camera {', '.join(unknown)}; it has {', '.join(groups.cameras)}")
-    frames = groups.frames[rows][:, [groups.cameras.index(name) for name in cameras]]
+def match(header: SceneHeader, capture: Path) -> Matched:
+    """Match the frames of a capture folder as a scene's header says, and find the scene's by their times. Raises
+    ValueError for a capture that did not film them."""
+    groups = _groups(capture, header.sync)
+    return Matched(capture, groups.cameras, groups.frames[_rows(groups, header.times_ns)])
+
+
+def filmed_views(header: SceneHeader, matched: Matched, cameras: Sequence[str] | None = None) -> Views:
+    """What these cameras filmed at the instants of a scene, frame by frame; None: all that capture and scene have.
+    Raises ValueError for a camera that the capture does not have."""
+    lenses = _lenses(header)
+    cameras = [name for name in lenses if name in matched.cameras] if cameras is None else cameras
+    if unknown := [name for name in cameras if name not in matched.cameras]:
+        raise ValueError(f"{matched.capture} has no camera {', '.join(unknown)}; it has {', '.join(matched.cameras)}")
+    frames = matched.frames[:, [matched.cameras.index(name) for name in cameras]]
     said = header.extra.get("transfer")
     return Views(
-        find_capture(capture).videos,
+        find_capture(matched.capture).videos,
         frames,
         [lenses[name] for name in cameras],
         max_width=_max_width(header.extra),
@@ -220,7 +238,7 @@ def _max_width(extra: Mapping[str, Any]) -> int | None:
     return None if said is None else whole(said, "extra: max_width", least=1, most=MOST_SIDE_PX)
 
 
-def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
+def _groups(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
     found = find_capture(capture)
     what = "the scene's header: sync"
     reference, tolerance_ns, clock = (field(sync, name, what) for name in ("reference", "tolerance_ns", "clock"))
@@ -238,9 +256,10 @@ def _matched(capture: Path, sync: Mapping[str, Any]) -> FrameGroups:
 
 
 def _rows(groups: FrameGroups, times_ns: np.ndarray) -> np.ndarray:
-    """Rows of the groups that were filmed at these times."""
-    rows = np.searchsorted(groups.times_ns, times_ns)
-    if (rows >= len(groups)).any() or (groups.times_ns[np.minimum(rows, len(groups) - 1)] != times_ns).any():
+    """Rows of the groups that were filmed at these times, ascending."""
+    middles = groups.times_ns[:-1] + np.diff(groups.times_ns) // 2
+    rows = np.searchsorted(middles, times_ns)
+    if not len(groups) or (np.abs(groups.times_ns[rows] - times_ns) > SAME_NS).any() or (np.diff(rows) < 1).any():
         raise ValueError("the capture did not film the scene's instants; is it the one that the scene was made from?")
     return rows
 

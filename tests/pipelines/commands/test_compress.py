@@ -57,13 +57,14 @@ def test_goals_that_cannot_be_are_refused(lossless, tmp_path, goal, capsys):
 def test_the_loss_that_footage_shows_is_what_was_asked_for_at_most(
     lossless, tmp_path, factor, code, capsys, monkeypatch
 ):
-    def scores(arguments, scene):
+    def scores(arguments, scene, matched):
         """Footage that shows a loss larger by a factor than the header reckons."""
         with open_scene(scene) as opened:
             said = opened.header.extra.get("compression", {"loss_db": 0.0})
         return {"psnr_db": 30 - factor * said["loss_db"], "ssim": 0.9}
 
     monkeypatch.setattr(compress, "_scores", scores)
+    monkeypatch.setattr(compress, "_matched", lambda *_: "which pictures are whose")
     monkeypatch.setattr(compress, "_footage", lambda *_: None)
     small = tmp_path / "small.mkv"
     words = ["compress", str(lossless), "--loss-db", "0.5", "--capture", str(tmp_path), "-o", str(small), "--json"]

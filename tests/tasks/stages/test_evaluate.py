@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from packuv.colour import linear_from_srgb, srgb_from_linear
 from packuv.metrics import psnr
 from packuv.score import Score, read_table, spread, summary, with_own_gain, write_table
+from sync.align import FrameGroups
 from tasks.artefacts.stage import Files
 from tasks.artefacts.store import Key
 from tasks.report.facts import still_trend
 from tasks.stages import evaluate
-from tasks.stages.evaluate import Evaluate, frame_scores
+from tasks.stages.evaluate import SAME_NS, Evaluate, _rows, frame_scores
 from tasks.stages.footage import Take
 
 RNG = np.random.default_rng(5)
@@ -41,6 +42,28 @@ def test_own_gain_does_not_explain_structure():
     noisy = np.clip(SCENE + RNG.normal(0, 0.1, SCENE.shape), 0, 1).astype(np.float32)
     # A single factor fitted to independent noise gains next to nothing.
     assert psnr(with_own_gain(noisy, SCENE), SCENE) == pytest.approx(psnr(noisy, SCENE), abs=0.5)
+
+
+TIMES = np.array([0, 33_366_666, 66_733_333, 100_100_000])
+"""Nanoseconds"""
+
+
+def rows_at(times: np.ndarray) -> list[int]:
+    nobody = np.zeros((len(TIMES), 1), np.int64)
+    return list(_rows(FrameGroups(("a",), "a", TIMES, nobody.astype(np.int32), nobody), times))
+
+
+@given(st.lists(st.integers(-SAME_NS, SAME_NS), min_size=3, max_size=3))
+def test_instants_are_found_by_their_times_however_they_were_heard(shifts):
+    assert rows_at(TIMES[[0, 1, 3]] + shifts) == [0, 1, 3]
+
+
+@pytest.mark.parametrize(
+    "times", [TIMES + SAME_NS + 1, TIMES - SAME_NS - 1, TIMES[:1] + 133_000_000, TIMES[[1, 1]] + [0, 1]]
+)
+def test_instants_that_were_not_filmed_are_refused(times):
+    with pytest.raises(ValueError, match="did not film the scene's instants"):
+        rows_at(times)
 
 
 FLICKER = (None, 0.01, 0.03)
