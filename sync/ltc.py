@@ -19,7 +19,7 @@ from sync.audio import Track, sound_tracks
 from sync.timecode import NANOSECONDS, frame_to_label, labels_to_ns
 from sync.tree import whole_file
 
-KEPT = 2
+KEPT = 3
 """Version of the files of what was heard"""
 RATE = 48_000
 """Samples a second that are read"""
@@ -227,13 +227,18 @@ def decode_ltc(samples: np.ndarray, start_s: float = 0.0) -> _Labels | None:
 
 
 def _words(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What ends with a sync word: uint8 [n, BITS], when it begins, float64 [n], seconds, and at which bit it ends."""
+    """What ends with a sync word: uint8 [n, BITS], when it begins, float64 [n], seconds, and at which bit it ends.
+
+    It begins where a line through its bits does: where each begins is off by a part of a sample, by more where the wave
+    is dull or noisy, and the first one after silence by more still.
+    """
     bits, starts = _bits(_turns(samples))
     if len(bits) < BITS:
         return np.zeros((0, BITS), np.uint8), np.zeros(0), np.zeros(0, np.int64)
     ends = np.flatnonzero((np.lib.stride_tricks.sliding_window_view(bits, len(SYNC)) == SYNC).all(axis=1)) + len(SYNC)
     ends = ends[ends >= BITS]
-    return bits[ends[:, None] - BITS + np.arange(BITS)], starts[ends - BITS] / RATE, ends
+    places = ends[:, None] - BITS + np.arange(BITS)
+    return bits[places], np.polyfit(np.arange(BITS), starts[places].T, 1)[1] / RATE, ends
 
 
 def _turns(samples: np.ndarray) -> np.ndarray:
