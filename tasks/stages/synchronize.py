@@ -45,7 +45,7 @@ FOOTAGE = "footage"
 class Synchronize(Stage):
     """Match the frames of all cameras: sync.json, groups.arrow, videos.json and the AVL index of each camera."""
 
-    name, version = "sync", 7
+    name, version = "sync", 6
     small = True
     videos: Files
     timecodes: Files
