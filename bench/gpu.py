@@ -59,7 +59,8 @@ from packuv.raster import RasterOptions, render
 from packuv.raster.cuda import render as on_gpu
 
 SIMULATED = bool(cast(Any, numba.config).ENABLE_CUDASIM)
-TESTS = ("raster/test_cuda.py", "fit/test_cuda.py", "fit/test_rows_cuda.py", "fit/test_resident.py")
+TESTS = ("raster/test_cuda.py", "fit/test_cuda.py", "fit/test_rows_cuda.py", "fit/test_density_cuda.py",
+         "fit/test_resident.py")  # fmt: skip
 NEAR = 0.05
 
 

@@ -91,6 +91,13 @@ class OnGpu:
         """int32 [N], as `GpuRendering.visible`."""
         return self.own.visible
 
+    @property
+    def weights(self) -> Tensor:
+        """float32 [N], as `GpuRendering.weights`, of a picture drawn with them; summed anew each time."""
+        sums = torch.zeros(len(self.visible), device=MEMORY)
+        run_rows(project.sum_shares, len(sums), self.shares, self.own.first_pair, sums)
+        return sums
+
 
 @dataclass(frozen=True)
 class GpuRendering:
@@ -166,12 +173,8 @@ def forward(
         weights=weights,
         over=over,
     )
-    sums = None
-    if weights:
-        sums = torch.zeros(len(gaussians), device=MEMORY)
-        run_rows(project.sum_shares, len(sums), drawn.shares, drawn.own.first_pair, sums)
     colour, depth, alpha = map(_array, drawn.pictures)
-    shown = None if sums is None else _array(sums)
+    shown = _array(drawn.weights) if weights else None
     return GpuRendering(colour, depth, alpha, _array(drawn.visible), shown, int(drawn.own.invalid), drawn)
 
 

@@ -53,7 +53,7 @@ masks = [np.ones((50, 70), bool)]
 count_hits(scene(5), [camera()], masks, near=0.05, options=LabelOptions(), device="cuda")
 photometric_loss(*np.zeros((2, 3, 9, 9), np.float32), options=PhotometricOptions(), device="cuda")
 model, bounds = Model(scene(5)), Bounds(np.zeros(3), 2.0, 0.05)
-rows = rows_cuda.RowsOnGpu(model, np.ones(5, bool), choose_quantizer(model.gaussians, bounds, 3))
+rows = rows_cuda.RowsOnGpu(model, np.ones(5, bool), bounds, choose_quantizer(model.gaussians, bounds, 3))
 rates = rows_cuda.rates_of(Rates(), model.gaussians, radius=1.0, progress=0.0)
 rows.step(rows.masters, rates, rows.rows, 1)
 held = ShotOnGpu(Shot(camera(), np.zeros((3, 50, 70), np.float32)))
