@@ -59,7 +59,8 @@ from packuv.raster import RasterOptions, render
 from packuv.raster.cuda import render as on_gpu
 
 SIMULATED = bool(cast(Any, numba.config).ENABLE_CUDASIM)
-TESTS = ("raster/test_cuda.py", "fit/test_cuda.py", "fit/test_rows_cuda.py", "fit/test_resident.py")
+TESTS = ("raster/test_cuda.py", "fit/test_cuda.py", "fit/test_rows_cuda.py", "fit/test_density_cuda.py",
+         "fit/test_resident.py")  # fmt: skip
 NEAR = 0.05
 
 
@@ -135,6 +136,7 @@ STAGES: Sequence[tuple[str, Any, str]] = (
     ("blend backward", on_gpu, "_blend_backward"),
     ("blend backward and gradients", resident, "carry"),
     ("Adam, guard, codes", rows_cuda.RowsOnGpu, "step"),
+    ("rows come and go", resident.ResidentSolver, "_change_density"),
 )
 
 
@@ -153,13 +155,13 @@ def measure_iteration(size: FitSize, options: GpuOptions) -> dict[str, Any]:
     solver.run(shots, options.iterations, of=1000)
     whole = 1000 * (time.perf_counter() - begun) / options.iterations
     with timed_stages() as times:
-        solver.run(shots, max(1, options.iterations // 4), of=1000)
+        solver.run(shots, options.iterations, of=1000, grow_from=size.gaussians)
     gaussians, shot = solver.model.gaussians, shots[0]
     return {
         "size": str(size),
         "first_seconds": first,
         "ms": whole,
-        "stages_ms": {name: 1000 * float(np.median(part)) for name, part in times.items()},
+        "stages_ms": {name: 1000 * float(np.median(part)) for name, part in times.items() if part},
         "cpu_ms": 1000 * step_seconds(size),
         "gsplat_draw_and_gradients_ms": _by_gsplat(gaussians, shot.camera),
         "memory_bytes": 0 if SIMULATED else torch.cuda.max_memory_allocated(),

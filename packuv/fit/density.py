@@ -7,7 +7,7 @@ parents instead of a threshold, so a run's size and memory are known beforehand.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from packuv.camera import PinholeCamera
 from packuv.fit.depth import COVERED
 from packuv.fit.model import Model
 from packuv.fit.start.bounds import Bounds
-from packuv.gaussians.floats import Gaussians, logit, opacity, rotation_matrices, rows_of
+from packuv.gaussians.floats import Gaussians, logit, opacities, opacity, rotation_matrices
 from packuv.gaussians.uvmap import assign_slots
 from packuv.gaussians.uvsize import UvOptions
 
@@ -54,6 +54,30 @@ class DensityOptions:
 
 SUPPORTED_AT = (0.4, 0.75, 1.0)
 """Shares of the iterations in which Gaussians are added, after which those that too few cameras show are pruned"""
+
+
+class Population(Protocol):
+    """N Gaussians whose number changes, wherever they are: a `Model` on the host, `RowsOnGpu` on a GPU."""
+
+    def __len__(self) -> int: ...
+
+    def column(self, name: str) -> np.ndarray:
+        """An attribute of all rows, float32 [N, ...], to be read only."""
+
+    def some(self, rows: np.ndarray) -> Gaussians:
+        """Copies of rows, by index."""
+
+    def put(self, name: str, rows: np.ndarray, values: np.ndarray) -> None:
+        """Change an attribute of rows, indices [n], to values [n, ...]."""
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Forget every row that is not in `rows`, bool [N] or ascending indices."""
+
+    def append(self, born: Gaussians) -> None:
+        """Add rows after the last one, with fresh moments."""
+
+    def overwrite(self, rows: np.ndarray, values: Gaussians) -> None:
+        """Give the rows, indices [n], new lives: values of n Gaussians and fresh moments."""
 
 
 class ScreenGradient:
@@ -109,7 +133,13 @@ def views_showing(rendering: Any, means: np.ndarray, camera: PinholeCamera, opti
 
 
 def grow(
-    model: Model, score: np.ndarray, count: int, *, bounds: Bounds, options: DensityOptions, rng: np.random.Generator
+    model: Population,
+    score: np.ndarray,
+    count: int,
+    *,
+    bounds: Bounds,
+    options: DensityOptions,
+    rng: np.random.Generator,
 ) -> np.ndarray:
     """Add `count` children to parents drawn by `score` [N] (0: never); returns the parents, int [count]."""
     parents = draw(score, count, rng)
@@ -129,25 +159,24 @@ def draw(score: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def divide(
-    model: Model, parents: np.ndarray, *, bounds: Bounds, options: DensityOptions, rng: np.random.Generator
+    model: Population, parents: np.ndarray, *, bounds: Bounds, options: DensityOptions, rng: np.random.Generator
 ) -> Gaussians:
     """Children of the parents, int [n], which change too: large ones split in two, small ones share their opacity."""
-    g = model.gaussians
-    child = rows_of(g, parents)
+    child = model.some(parents)
     scales = np.exp(child.log_scales)
     large = scales.max(axis=1) > options.large * bounds.radius
     noise = rng.standard_normal(scales.shape) * np.where(large[:, None], 1.0, 0.3)
     child.means[:] += np.einsum("nij,nj->ni", rotation_matrices(child.quaternions), scales * noise)
     halves = logit(1 - np.sqrt(1 - np.minimum(opacity(child), 0.999)))
     child.log_scales[large] -= SHRINK
-    g.log_scales[parents[large]] -= SHRINK
     child.opacity_logits[~large] = halves[~large]
-    g.opacity_logits[parents[~large]] = halves[~large]
+    model.put("log_scales", parents[large], child.log_scales[large])
+    model.put("opacity_logits", parents[~large], halves[~large])
     return child
 
 
 def relocate(
-    model: Model,
+    model: Population,
     score: np.ndarray,  # [N]
     rows: np.ndarray,  # bool [N], the rows that may change
     *,
@@ -160,7 +189,7 @@ def relocate(
 
     At most `share` of the living come back at once. Returns how many. As the relocation of 3DGS-MCMC, within `rows`.
     """
-    dead = np.flatnonzero(rows & (opacity(model.gaussians) <= options.min_opacity))
+    dead = np.flatnonzero(rows & (opacities(model.column("opacity_logits")) <= options.min_opacity))
     alive = rows.copy()
     alive[dead] = False
     parents = draw(np.where(alive, score, 0), min(len(dead), round(share * alive.sum())), rng)

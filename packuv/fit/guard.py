@@ -95,6 +95,12 @@ class Guard:
                      when, term, rows[0], _worst(source[rows[0]]), others, fate)  # fmt: skip
 
 
+def emptied(gaussians: Gaussians, bounds: Bounds) -> tuple[Gaussians, int]:
+    """A copy in which broken ones are empty, and how many those are."""
+    model = Model(gaussians)
+    return model.gaussians, Guard(model, bounds).count
+
+
 def _worst(values: np.ndarray) -> float:
     """The value that is not finite, or the largest."""
     flat = np.atleast_1d(values).ravel()

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from packuv.fit.adam import AdamState, adam_step
-from packuv.gaussians.floats import ATTRIBUTES, Gaussians
+from packuv.gaussians.floats import ATTRIBUTES, Gaussians, rows_of
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,18 @@ class Model:
             width = math.prod(values.shape[1:])
             adam_step(values, gradient, self.moments[name], rows=rows,
                       rate=rates.columns(name, width, radius=radius, progress=progress))  # fmt: skip
+
+    def column(self, name: str) -> np.ndarray:
+        """An attribute of all rows, float32 [N, ...]."""
+        return np.asarray(getattr(self.gaussians, name))
+
+    def some(self, rows: np.ndarray) -> Gaussians:
+        """Copies of rows, by index."""
+        return rows_of(self.gaussians, rows)
+
+    def put(self, name: str, rows: np.ndarray, values: np.ndarray) -> None:
+        """Change an attribute of rows, indices [n], to values [n, ...]; moments stay."""
+        getattr(self.gaussians, name)[rows] = values
 
     def keep(self, rows: np.ndarray) -> None:
         """Forget every row that is not in `rows`, bool [N] or ascending indices."""

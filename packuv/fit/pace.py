@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from packuv.camera import PinholeCamera
+from packuv.fit.density import DensityOptions
 from packuv.fit.model import Model
 from packuv.fit.options import FirstOptions
 from packuv.fit.shots import Shot
@@ -61,7 +62,8 @@ def made_up(size: FitSize, device: str = "cpu") -> tuple[Solver, list[Shot]]:
     target = rng.random((3, size.height, size.width)).astype(np.float32)
     shots = [Shot(_camera(size, angle), target) for angle in (0.0, 1.5, 3.0, 4.5)]
     bounds = Bounds(np.zeros(3), 1.0, 0.2)
-    return open_solver(Model(gaussians), bounds, FirstOptions(device=device), rng), shots
+    room = DensityOptions(cap=5 * size.gaussians // 4)
+    return open_solver(Model(gaussians), bounds, FirstOptions(device=device, density=room), rng), shots
 
 
 def _camera(size: FitSize, angle: float) -> PinholeCamera:

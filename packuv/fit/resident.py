@@ -1,8 +1,9 @@
 """A solver whose iterations stay on the GPU: pictures, masters, moments, codes, last good values, screen gradients.
 
-The model comes home, to the host's memory, where the number of its rows changes or a run of iterations ends; in between
-a camera and a few numbers go up in an iteration, and the number of its pairs comes down. Choices at random are drawn by
-`Solver`, on the host, so that both devices walk the same schedule.
+The model comes home, to the host's memory, where a run of iterations of a keyframe, or a frame, ends. In between a
+camera and a few numbers go up in an iteration, and the number of its pairs comes down; where the number of rows
+changes, which of them stay and their screen gradients come down, those that are born go up. Choices at random are
+drawn by `Solver`, on the host, so that both devices walk the same schedule.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import torch
 from torch import Tensor
 
 from packuv.fit.backdrop import Backdrop
+from packuv.fit.density import Population, ScreenGradient
+from packuv.fit.density_cuda import prune, views_showing
 from packuv.fit.model import Model, Rates
 from packuv.fit.options import SolverOptions
 from packuv.fit.rows_cuda import RowsOnGpu, rates_of
@@ -31,17 +34,21 @@ from packuv.raster.cuda.render import OnGpu, carry, draw
 
 
 class _Away:
-    """What iterations have changed on the GPU since the model left."""
+    """The model on the GPU, and what iterations there have not told the host yet."""
 
     def __init__(self, rows: RowsOnGpu) -> None:
         self.rows = rows
-        count = len(rows)
+        self.overflown = torch.zeros(1, dtype=torch.int64, device=MEMORY)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, with the rows as they are now."""
+        count = len(self.rows)
         self.length = torch.zeros(count, dtype=torch.float64, device=MEMORY)
         """As `ScreenGradient.total`"""
         self.seen = torch.zeros(count, dtype=torch.int64, device=MEMORY)
-        self.overflown = torch.zeros(1, dtype=torch.int64, device=MEMORY)
         self.losses: list[tuple[str, dict[str, Any]]] = []
-        """Camera and losses of each iteration, which become numbers at home"""
+        """Camera and losses of each iteration"""
 
 
 class ResidentSolver(Solver):
@@ -107,20 +114,55 @@ class ResidentSolver(Solver):
         """What is on the GPU; the model goes there if it is at home."""
         if self._away is None:
             quantizer = self._quantizer if self._options.low_precision else None
-            self._away = _Away(RowsOnGpu(self.model, self.rows, quantizer))
+            self._away = _Away(RowsOnGpu(self.model, self.rows, self.bounds, quantizer))
         return self._away
 
+    @property
+    def _population(self) -> Population:
+        return self.model if self._away is None else self._away.rows
+
+    def _tell(self) -> None:
+        if (away := self._away) is None:
+            return
+        _to_numbers(away.losses)
+        self.gradient.total += away.length.cpu().numpy()
+        self.gradient.seen += away.seen.cpu().numpy()
+        away.forget()
+
     def _come_home(self) -> None:
+        self._tell()
         away, self._away = self._away, None
         if away is None:
             return
-        _to_numbers(away.losses)
         self._guard.count += away.rows.bring_home(self.model)
         self._guard.renew(self.model)
         self._overflown += int(away.overflown)
         self._drawn = None
-        self.gradient.total += away.length.cpu().numpy()
-        self.gradient.seen += away.seen.cpu().numpy()
+
+    def _start_afresh(self) -> None:
+        if self._away is None:
+            super()._start_afresh()
+            return
+        self._away.rows.renew()
+        self._away.forget()
+        self.gradient = ScreenGradient(len(self._away.rows))
+
+    def worth_keeping(self) -> np.ndarray:
+        if self._away is None:
+            return super().worth_keeping()
+        options, taken, masters = self._options, self.backdrop.gaussians.means, self._away.rows.masters
+        kept = prune(masters, self.gradient, taken, bounds=self.bounds, options=options.density, uv=options.uv)
+        return kept.cpu().numpy()
+
+    def supported(self, shots: Sequence[Shot]) -> np.ndarray:
+        rows, density = self._left().rows, self._options.density
+        raster, degree = RasterOptions(self.bounds.near, device=self._options.device), self.model.gaussians.sh_degree
+        views = torch.zeros(len(rows), dtype=torch.int64, device=MEMORY)
+        for shot in shots:
+            rendering = draw(rows.drawn, shot.camera, options=raster, sh_degree=degree, weights=True)
+            views += views_showing(rendering, rows.masters[0], shot.camera, density)
+        self._come_home()
+        return (views >= density.least_views).cpu().numpy()
 
     def _on_gpu(self, shot: Shot) -> ShotOnGpu:
         held = self._shots.get(shot.camera.name)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numba.cuda
@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from packuv.fit.adam import AdamOptions, AdamState, corrections, factors, moved
-from packuv.fit.guard import GRADIENT_LIMIT, VALUE_LIMITS, copy_row, fault_of_gradients, fault_of_values
+from packuv.fit.guard import GRADIENT_LIMIT, VALUE_LIMITS, copy_row, emptied, fault_of_gradients, fault_of_values
 from packuv.fit.model import Model, Rates
+from packuv.fit.start.bounds import Bounds
 from packuv.gaussians.codes import Codes, Quantizer, decode_row, encode_row
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, arrays
 from packuv.raster.cuda.launch import MEMORY, on_device, run_rows, shared
@@ -30,16 +31,19 @@ _log = logging.getLogger(__name__)
 
 
 class RowsOnGpu:
-    """N Gaussians under optimisation, on the GPU until `bring_home`."""
+    """N Gaussians under optimisation, on the GPU until `bring_home`.
 
-    def __init__(self, model: Model, rows: np.ndarray, quantizer: Quantizer | None) -> None:
+    A `Population`: what changes other than by a step is drawn, and guarded, from `renew` on.
+    """
+
+    def __init__(self, model: Model, rows: np.ndarray, bounds: Bounds, quantizer: Quantizer | None) -> None:
         """Take a model that is in order, and the rows that may change, bool [N]; draw what its codes decode to, or the
         masters without a quantizer."""
         self.masters = tuple(map(on_device, arrays(model.gaussians)))
         """float32, as the arrays of `Gaussians`"""
         self.rows = on_device(np.ascontiguousarray(rows).view(np.uint8))
         """uint8 [N], 1 for those that may change"""
-        self._quantizer = quantizer
+        self._bounds, self._quantizer = bounds, quantizer
         self._good = tuple(values.clone() for values in self.masters)
         states = list(model.moments.values())
         self._first, self._second = (
@@ -51,6 +55,9 @@ class RowsOnGpu:
         self._corrections = on_device(corrections(self._adam.beta1, self._adam.beta2))
         self._limits = on_device(VALUE_LIMITS)
         self._told = torch.tensor([0, _NEVER], dtype=torch.int64, device=MEMORY)
+        self._emptied = 0
+        self._fresh = torch.zeros_like(self.rows)
+        """uint8 [N], 1 for those that something else than a step has changed since `renew`"""
         self.drawn = self.masters
         """What the renderer draws"""
         if quantizer is not None:
@@ -75,11 +82,68 @@ class RowsOnGpu:
         run_rows(_advance, len(self), *values, *slopes, *memory, *given)
         limits = self._limits, _f32(GRADIENT_LIMIT)
         run_rows(_guard, len(self), *values, *slopes, *good, *memory, moving, *limits, number, self._told)
-        if self._quantizer is not None:
-            logits, sh = self.masters[3], _flat(self.masters)[4]
-            drawn = *self.drawn[:4], _flat(self.drawn)[4]
-            codes = self._xyz, self._attributes
-            run_rows(_code, len(self), *values[:3], logits, sh, moving, *self._scale, *codes, *drawn)
+        self._draw_again(moving)
+
+    def _draw_again(self, rows: Tensor) -> None:
+        """Encode these rows, uint8 [N], and draw what the codes decode to; with no quantizer masters are drawn."""
+        if self._quantizer is None:
+            return
+        masters, drawn = _flat(self.masters), _flat(self.drawn)
+        masters[3], drawn[3] = self.masters[3], self.drawn[3]
+        run_rows(_code, len(self), *masters, rows, *self._scale, self._xyz, self._attributes, *drawn)
+
+    def column(self, name: str) -> np.ndarray:
+        return _array(self._master(name))
+
+    def some(self, rows: np.ndarray) -> Gaussians:
+        index = on_device(rows)
+        return Gaussians(*(_array(values[index]) for values in self.masters))
+
+    def put(self, name: str, rows: np.ndarray, values: np.ndarray) -> None:
+        index = on_device(rows)
+        self._master(name)[index] = on_device(values)
+        self._fresh[index] = 1
+
+    def keep(self, rows: np.ndarray) -> None:
+        index = on_device(np.flatnonzero(rows) if rows.dtype == bool else rows)
+        self._change_each(lambda values: values[index])
+
+    def append(self, born: Gaussians) -> None:
+        """They may change; broken ones are emptied."""
+        before, count = len(self), len(born)
+        self._change_each(lambda values: torch.cat([values, values.new_zeros((count, *values.shape[1:]))]))
+        self.rows[before:] = 1
+        self.overwrite(np.arange(before, before + count), born)
+
+    def overwrite(self, rows: np.ndarray, values: Gaussians) -> None:
+        """Broken ones are emptied."""
+        values, broken = emptied(values, self._bounds)
+        self._emptied += broken
+        for name in ATTRIBUTES:
+            self.put(name, rows, getattr(values, name))
+        for moment in (self._first, self._second, self._steps):
+            moment[on_device(rows)] = 0
+
+    def renew(self) -> None:
+        """Take the rows as they stand for good, and draw what the changed ones' codes decode to."""
+        self._good = tuple(values.clone() for values in self.masters)
+        self._draw_again(self._fresh)
+        self._fresh.zero_()
+
+    def _master(self, name: str) -> Tensor:
+        return self.masters[ATTRIBUTES.index(name)]
+
+    def _change_each(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Replace what there is of each row."""
+        self.masters = tuple(map(change, self.masters))
+        self.rows, self._fresh, self._first, self._second, self._steps = map(
+            change, (self.rows, self._fresh, self._first, self._second, self._steps)
+        )
+        if self._quantizer is None:
+            self.drawn = self.masters
+        else:
+            self._xyz, self._attributes, *drawn = map(change, (self._xyz, self._attributes, *self.drawn))
+            self.drawn = tuple(drawn)
 
     def bring_home(self, model: Model) -> int:
         """Give the model its masters and moments; returns how many times a row went back to its last good state.
@@ -113,7 +177,7 @@ class RowsOnGpu:
             others = f", the first of {count} times" if count > 1 else ""
             _log.warning("iteration %d, %s of Gaussian %d is not finite or absurd%s; it goes back to its last good "
                          "state and the fit goes on", number, term, row, others)  # fmt: skip
-        return count
+        return count + self._emptied
 
 
 def rates_of(rates: Rates, gaussians: Gaussians, *, radius: float, progress: float) -> Tensor:

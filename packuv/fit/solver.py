@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from packuv.fit.backdrop import Backdrop
-from packuv.fit.density import ScreenGradient, grow, prune, relocate, views_showing
+from packuv.fit.density import Population, ScreenGradient, grow, prune, relocate, views_showing
 from packuv.fit.guard import Guard
 from packuv.fit.labels import active_tiles
 from packuv.fit.model import Model, Rates
@@ -157,7 +157,7 @@ class Solver:
         self.keep(stays)
 
     def keep(self, rows: np.ndarray) -> None:
-        self.model.keep(rows)
+        self._population.keep(rows)
         self.rows = self.rows[rows]
         self._start_afresh()
 
@@ -175,7 +175,7 @@ class Solver:
             index, opaque = self._next(shots), self._options.random_background
             losses.append(self._iterate(shots, index, self._near(), progress=self.done / of, opaque=opaque))
             if grow_from is not None and self.done % density.every == 0 and self.done < of * density.until:
-                self._come_home()
+                self._tell()
                 self._change_density(of, grow_from)
             if ticks:
                 ticks.advance()
@@ -201,7 +201,7 @@ class Solver:
             losses |= fresh
             if done <= limit * options.density.until:
                 relocate(
-                    self.model,
+                    self._population,
                     self.gradient.mean,
                     self.rows,
                     bounds=self.bounds,
@@ -210,6 +210,7 @@ class Solver:
                     rng=self._rng,
                 )
                 self._start_afresh()
+        self._come_home()
         return (mean_losses([losses[shot] for shot in sorted(losses)]) if losses else None), done
 
     def _round(self, shots: Sequence[Shot], count: int, rates: Rates) -> dict[int, Losses]:
@@ -220,7 +221,7 @@ class Solver:
             found = self._iterate(shots, index, near, progress=0.0, rates=rates)
             if near == self.bounds.near:
                 losses[index] = found
-        self._come_home()
+        self._tell()
         return losses
 
     def _next(self, shots: Sequence[Shot]) -> int:
@@ -239,7 +240,7 @@ class Solver:
         rates: Rates | None = None,
         opaque: bool = False,
     ) -> Losses:
-        """One iteration; its losses are numbers from the next `_come_home` on."""
+        """One iteration; its losses are numbers from the next `_tell` on."""
         options, shot = self._options, shots[index].opened()
         behind = None
         if opaque:
@@ -293,8 +294,16 @@ class Solver:
         """Share of the picture that may show nothing."""
         return float(shot.void.mean())
 
+    @property
+    def _population(self) -> Population:
+        """The Gaussians, where they are."""
+        return self.model
+
+    def _tell(self) -> None:
+        """From here on the losses of the iterations so far are numbers, and `gradient` knows of them."""
+
     def _come_home(self) -> None:
-        """From here on the model is as the iterations so far have left it, and their losses are numbers."""
+        """From here on the model is as the iterations so far have left it, and `_tell` has been done."""
 
     def _colour_behind(self) -> np.ndarray:
         """At random, float32 [3, 1, 1]."""
@@ -354,14 +363,14 @@ class Solver:
         self.keep(kept)
         share = min(1.0, self.done / (of * options.until))
         target = round(grow_from + (self.cap - grow_from) * share)
-        count = max(0, min(target, self.cap) - len(self.model))
-        before = len(self.model)
-        grow(self.model, score, count, bounds=self.bounds, options=options, rng=self._rng)
-        self.rows = np.concatenate([self.rows, np.ones(len(self.model) - before, bool)])
+        before = len(self._population)
+        count = max(0, min(target, self.cap) - before)
+        grow(self._population, score, count, bounds=self.bounds, options=options, rng=self._rng)
+        self.rows = np.concatenate([self.rows, np.ones(len(self._population) - before, bool)])
         self._start_afresh()
 
     def _start_afresh(self) -> None:
-        self.gradient = ScreenGradient(len(self.model))
+        self.gradient = ScreenGradient(len(self._population))
         self._drawn = None
         self._guard.renew(self.model)
 

@@ -50,7 +50,12 @@ def arrays(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
 
 def opacity(gaussians: Gaussians) -> np.ndarray:
     """[N], in 0..1"""
-    return 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    return opacities(gaussians.opacity_logits)
+
+
+def opacities(logits: np.ndarray) -> np.ndarray:
+    """float64, in 0..1"""
+    return np.asarray(1 / (1 + np.exp(-logits.astype(np.float64))))
 
 
 def logit(value: np.ndarray) -> np.ndarray:

@@ -120,9 +120,9 @@ def _alpha(exponent):
 
 
 @cuda.jit
-def blend(record, gaussians, masks, slots, start, shown, tiles_x, background, colour, depth, alpha, used_end,
+def blend(record, gaussians, masks, slots, start, tiles, tiles_x, background, colour, depth, alpha, used_end,
           weighed, shares):  # fmt: skip
-    """Draw the tiles whose numbers are `shown`, a block each; the others are left as they are.
+    """Draw the tiles whose numbers are `tiles`, a block each; the others are left as they are.
 
     Pairs by slot: `gaussians` and `masks`; a tile's list is `slots` from its `start` to the next. `used_end` [tiles]
     receives the end of what was walked. Where `weighed` is not 0, `shares` [pairs] receives per slot the sum of
@@ -132,7 +132,7 @@ def blend(record, gaussians, masks, slots, start, shown, tiles_x, background, co
     seen_masks = cuda.shared.array(_BATCH, int32)
     living = cuda.shared.array(_BLOCKS, int32)
     sums = cuda.shared.array((_BATCH, _WARPS, 1), float32)
-    t, tile = cuda.threadIdx.x, shown[cuda.blockIdx.x]
+    t, tile = cuda.threadIdx.x, tiles[cuda.blockIdx.x]
     warp, lane = t // 32, t % 32
     x0, y0 = TILE * (tile % tiles_x), TILE * (tile // tiles_x)
     column, row, block = _place(t)
@@ -198,7 +198,7 @@ def _last_chosen(t, begin, end, gaussians, slots, rows, last):
 
 
 @cuda.jit
-def blend_backward(record, gaussians, masks, slots, start, shown, used_end, tiles_x, colour, depth, alpha,
+def blend_backward(record, gaussians, masks, slots, start, tiles, used_end, tiles_x, colour, depth, alpha,
                    d_colour, d_depth, d_alpha, rows, first_slot, partial, used):  # fmt: skip
     """Partial gradients [pairs, 10] of pairs whose row is chosen, as the CPU's; `used` [pairs] says which there are.
 
@@ -210,7 +210,7 @@ def blend_backward(record, gaussians, masks, slots, start, shown, used_end, tile
     living = cuda.shared.array(_BLOCKS, int32)
     sums = cuda.shared.array((_BATCH, _WARPS, SUMS), float32)
     last = cuda.shared.array(1, int32)
-    t, tile = cuda.threadIdx.x, shown[cuda.blockIdx.x]
+    t, tile = cuda.threadIdx.x, tiles[cuda.blockIdx.x]
     warp, lane = t // 32, t % 32
     x0, y0 = TILE * (tile % tiles_x), TILE * (tile // tiles_x)
     column, row, block = _place(t)

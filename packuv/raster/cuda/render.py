@@ -65,8 +65,8 @@ class _Drawn:
     """int64 [P], by tile and depth"""
     start: Tensor
     """int64 [tiles + 1]: bounds of each tile's list in `slots`"""
-    shown: Tensor
-    """int64: numbers of the tiles whose list is not empty"""
+    tiles: Tensor
+    """int64: numbers of those that are drawn"""
     used_end: Tensor
     """int64 [tiles]"""
 
@@ -90,6 +90,13 @@ class OnGpu:
     def visible(self) -> Tensor:
         """int32 [N], as `GpuRendering.visible`."""
         return self.own.visible
+
+    @property
+    def weights(self) -> Tensor:
+        """float32 [N], as `GpuRendering.weights`, of a picture drawn with them; summed anew each time."""
+        sums = torch.zeros(len(self.visible), device=MEMORY)
+        run_rows(project.sum_shares, len(sums), self.shares, self.own.first_pair, sums)
+        return sums
 
 
 @dataclass(frozen=True)
@@ -166,12 +173,8 @@ def forward(
         weights=weights,
         over=over,
     )
-    sums = None
-    if weights:
-        sums = torch.zeros(len(gaussians), device=MEMORY)
-        run_rows(project.sum_shares, len(sums), drawn.shares, drawn.own.first_pair, sums)
     colour, depth, alpha = map(_array, drawn.pictures)
-    shown = None if sums is None else _array(sums)
+    shown = _array(drawn.weights) if weights else None
     return GpuRendering(colour, depth, alpha, _array(drawn.visible), shown, int(drawn.own.invalid), drawn)
 
 
@@ -190,7 +193,7 @@ def draw(
     view = view_constants(camera, options.near, options.low_pass_px2)
     active = checked_tiles(tiles, camera) if over is None else over.tiles_to_draw(tiles, weights, camera, options)
     own = _listed(fields, sh_degree, view, active, camera.height)
-    drawn = _sorted(own.pairs if over is None else _joined(over.pairs, own.pairs, active), active.size)
+    drawn = _sorted(own.pairs if over is None else _joined(over, own.pairs, active), active)
     shares = torch.zeros(len(own.pairs.keys) if weights else 1, device=MEMORY)
     pictures = _blended(drawn, camera, on_device(np.asarray(background, np.float32)), weights, shares)
     return OnGpu(fields, on_device(view), sh_degree, own, drawn, pictures, shares)
@@ -255,35 +258,37 @@ def _shown(listed: _Listed) -> Pairs:
     return Pairs(pairs.record[shows], pairs.keys, rows[pairs.gaussians], pairs.masks)
 
 
-def _sorted(pairs: Pairs, tile_count: int) -> _Drawn:
+def _sorted(pairs: Pairs, active: np.ndarray) -> _Drawn:
     """Lists by tile and depth; at equal depth in the order of slots."""
     keys, slots = torch.sort(pairs.keys, stable=True)
-    bounds = torch.arange(tile_count + 1, device=MEMORY) << 32
+    bounds = torch.arange(active.size + 1, device=MEMORY) << 32
     start = torch.searchsorted(keys, bounds)
-    shown = torch.nonzero(start[1:] > start[:-1])[:, 0]
-    return _Drawn(pairs, slots, start, shown, torch.zeros_like(start[1:]))
+    return _Drawn(pairs, slots, start, on_device(np.flatnonzero(active)), torch.zeros_like(start[1:]))
 
 
-def _joined(still: Pairs, own: Pairs, active: np.ndarray) -> Pairs:
+def _joined(layer: GpuLayer, own: Pairs, active: np.ndarray) -> Pairs:
     """Those of a layer, which come first, and others, in the active tiles."""
-    keep = on_device(active).reshape(-1)[still.keys >> 32] > 0
+    still = layer.pairs
+    if not np.array_equal(active, layer.active):
+        kept = torch.nonzero(on_device(active).reshape(-1)[still.keys >> 32])[:, 0]
+        still = Pairs(still.record, still.keys[kept], still.gaussians[kept], still.masks[kept])
     return Pairs(
         torch.cat([still.record, own.record]),
-        torch.cat([still.keys[keep], own.keys]),
-        torch.cat([still.gaussians[keep], own.gaussians + len(still.record)]),
-        torch.cat([still.masks[keep], own.masks]),
+        torch.cat([still.keys, own.keys]),
+        torch.cat([still.gaussians, own.gaussians + len(still.record)]),
+        torch.cat([still.masks, own.masks]),
     )
 
 
 def _blended(
     drawn: _Drawn, camera: PinholeCamera, background: Tensor, weighed: bool, shares: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour, depth and alpha, [3, H, W], [H, W] and [H, W]; nothing but background where no tile is shown."""
+    """Colour, depth and alpha, [3, H, W], [H, W] and [H, W]; nothing but background where nothing is listed."""
     shape = camera.height, camera.width
     colour = background[:, None, None].expand(3, *shape).contiguous()
     depth, alpha = torch.zeros(shape, device=MEMORY), torch.zeros(shape, device=MEMORY)
     out = colour, depth, alpha, drawn.used_end, int(weighed), shares
-    run(blend.blend, len(drawn.shown), *_walked(drawn), -(-camera.width // TILE), background, *out)
+    run(blend.blend, _blocks(drawn), *_walked(drawn), -(-camera.width // TILE), background, *out)
     return colour, depth, alpha
 
 
@@ -295,13 +300,18 @@ def _blend_backward(kept: OnGpu, slopes: Sequence[Tensor], chosen: Tensor, parti
     columns = -(-kept.pictures[1].shape[1] // TILE)
     first_slot = len(drawn.slots) - len(own.keys)
     given = *_walked(drawn), drawn.used_end, columns, *kept.pictures, *slopes, rows, first_slot
-    run(blend.blend_backward, len(drawn.shown), *given, partial, used)
+    run(blend.blend_backward, _blocks(drawn), *given, partial, used)
 
 
 def _walked(drawn: _Drawn) -> tuple[Tensor, ...]:
     """What kernels walk the lists by."""
     pairs = drawn.pairs
-    return pairs.record, pairs.gaussians, pairs.masks, drawn.slots, drawn.start, drawn.shown
+    return pairs.record, pairs.gaussians, pairs.masks, drawn.slots, drawn.start, drawn.tiles
+
+
+def _blocks(drawn: _Drawn) -> int:
+    """One for each tile. How many lists are empty only the GPU knows, and to ask would be to wait for it."""
+    return len(drawn.tiles) if len(drawn.slots) else 0
 
 
 def _slope(gradient: np.ndarray | None, picture: Tensor) -> Tensor:

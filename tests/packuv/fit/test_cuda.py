@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 import torch
 
+from packuv.fit.density import DensityOptions
 from packuv.fit.device import compared_differently, drawn_differently, labelled_differently
 from packuv.fit.losses import PhotometricOptions, photometric_loss
 from packuv.fit.model import Model
 from packuv.fit.options import FitOptions
 from packuv.fit.shots import Shot
+from packuv.fit.solver import Solver
 from packuv.fit.solvers import open_solver
 from packuv.fit.start.bounds import Bounds
+from packuv.gaussians.floats import arrays
 from packuv.raster import render
 from tests.support.dense_raster import OPTIONS, camera, scene
 from tests.support.needs import needs
@@ -65,17 +68,32 @@ def test_without_an_active_tile_there_is_no_loss():
     assert not there.gradient.any()
 
 
-@needs("cuda", torch.cuda.is_available(), "no CUDA device, and the simulator would take minutes")
-def test_the_made_up_scene_and_a_fit_are_the_cpus():
-    assert drawn_differently("cuda") is None
+on_a_gpu = needs("cuda", torch.cuda.is_available(), "no CUDA device, and the simulator would take minutes")
+
+
+def fitted(device: str) -> tuple[Solver, list[float]]:
+    """A fit that grows, and its losses."""
     views = [camera(), camera(64, 48)]
     targets = [render(scene(60, degree=0, seed=4), view, options=OPTIONS).colour.clip(0, 1) for view in views]
     shots = [Shot(view, target) for view, target in zip(views, targets, strict=True)]
-    losses = []
-    for device in ("cpu", "cuda"):
-        options = FitOptions(device=device)
-        bounds = Bounds(np.zeros(3), 2.0, 0.05)
-        solver = open_solver(Model(scene(60, degree=0)), bounds, options, np.random.default_rng(0))
-        losses.append([solver.run(shots, 4, of=12)["photometric"] for _ in range(3)])
-    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
-    assert losses[1][-1] < 0.9 * losses[1][0]
+    options = FitOptions(device=device, density=DensityOptions(cap=90, every=2))
+    solver = open_solver(Model(scene(60, degree=0)), Bounds(np.zeros(3), 2.0, 0.05), options, np.random.default_rng(0))
+    return solver, [solver.run(shots, 4, of=12, grow_from=60)["photometric"] for _ in range(3)]
+
+
+@on_a_gpu
+def test_the_made_up_scene_and_a_fit_are_the_cpus():
+    assert drawn_differently("cuda") is None
+    (_, losses), (_, found) = fitted("cpu"), fitted("cuda")
+    assert found == pytest.approx(losses, rel=1e-3)
+    assert found[-1] < 0.9 * found[0]
+
+
+@on_a_gpu
+def test_a_fit_is_the_same_every_time():
+    """Every sum has one order."""
+    (first, losses), (second, again) = fitted("cuda"), fitted("cuda")
+    assert losses == again
+    assert len(first.model) > 60
+    same = zip(*(arrays(solver.model.gaussians) for solver in (first, second)), strict=True)
+    assert all(np.array_equal(one, other) for one, other in same)

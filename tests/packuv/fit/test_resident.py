@@ -94,8 +94,27 @@ def test_the_device_decides_who_iterates():
     assert isinstance(solver("cuda"), ResidentSolver)
 
 
-def test_a_keyframe_grows_and_is_pruned_as_on_the_cpu():
-    """Before colours at random, with the near plane jittered; then quantized. Two of ten are too faint to stay."""
+@pytest.fixture
+def ways(monkeypatch):
+    """Each time that a model goes to the GPU or comes back."""
+    found = []
+
+    class Counted(resident.RowsOnGpu):
+        def __init__(self, *given: Any) -> None:
+            found.append("there")
+            super().__init__(*given)
+
+        def bring_home(self, model: Model) -> int:
+            found.append("back")
+            return super().bring_home(model)
+
+    monkeypatch.setattr(resident, "RowsOnGpu", Counted)
+    return found
+
+
+def test_a_keyframe_grows_and_is_pruned_as_on_the_cpu(ways):
+    """Before colours at random, with the near plane jittered; then quantized. Two of ten are too faint to stay. The
+    model goes to the GPU and comes back once in each of the three runs, not where it grows."""
     changes = {
         "density": DensityOptions(cap=16, every=2, min_opacity=0.3, large=0.05),
         "opacity_weight": 0.01,
@@ -118,6 +137,16 @@ def test_a_keyframe_grows_and_is_pruned_as_on_the_cpu():
     for truth, got in zip(losses, losses_there, strict=True):
         assert got == pytest.approx(dict(truth), rel=TOLERANCE, abs=1e-7)
     assert_alike(here, there)
+    assert ways == 3 * ["there", "back"]
+
+
+def test_who_is_supported_is_the_cpus():
+    found = []
+    for device in ("cpu", "cuda"):
+        tried = solver(device, density=DensityOptions(cap=16))
+        found.append(tried.supported(shots()))
+    assert np.array_equal(*found)
+    assert 0 < found[0].sum() < 10
 
 
 def frame(device: str, quantizer: Any, rows: np.ndarray) -> tuple[Solver, Any, Codes]:
@@ -131,10 +160,11 @@ def frame(device: str, quantizer: Any, rows: np.ndarray) -> tuple[Solver, Any, C
     return tried, tried.settle(shots(), options, usual=np.inf), before
 
 
-def test_a_frame_over_a_backdrop_is_the_cpus_and_frozen_rows_keep_every_code():
+def test_a_frame_over_a_backdrop_is_the_cpus_and_frozen_rows_keep_every_code(ways):
     rows, quantizer = np.arange(10) % 2 == 0, choose_quantizer(scene(10, degree=0), BOUNDS, 0)
     (here, settled, before), (there, settled_there, _) = (frame(device, quantizer, rows) for device in ("cpu", "cuda"))
     assert settled_there[1] == settled[1]
+    assert ways == ["there", "back"]
     assert settled_there[0] == pytest.approx(dict(settled[0]), rel=TOLERANCE)
     assert_alike(here, there)
     after, found = codes(here), codes(there)

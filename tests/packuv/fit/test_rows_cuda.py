@@ -54,7 +54,7 @@ def moving(number: int) -> np.ndarray:
 def walked(degree: int, quantizer: Quantizer | None, spoil=lambda number, gradients: None):
     """A model after some steps on the CPU, another with the rows it had on the GPU, and both counts of faults."""
     here, there = Model(scene(COUNT, degree=degree)), Model(scene(COUNT, degree=degree))
-    guard, rows = Guard(here, BOUNDS), RowsOnGpu(there, ROWS, quantizer)
+    guard, rows = Guard(here, BOUNDS), RowsOnGpu(there, ROWS, BOUNDS, quantizer)
     for number in range(STEPS):
         gradients, chosen = slopes(here.gaussians, number), moving(number)
         spoil(number, gradients)
@@ -161,7 +161,7 @@ def _with_logit(rows: RowsOnGpu, row: int, value: float) -> Gaussians:
 
 def test_no_rows():
     model = Model(scene(0, degree=1))
-    rows = RowsOnGpu(model, np.zeros(0, bool), tables(1))
+    rows = RowsOnGpu(model, np.zeros(0, bool), BOUNDS, tables(1))
     rows.step(rows.masters, rates_of(RATES, model.gaussians, **GIVEN), rows.rows, 1)
     assert rows.bring_home(model) == 0
     assert len(model) == 0

@@ -10,7 +10,8 @@ import pytest
 
 from tests.support.needs import needs
 
-PROGRAM = """
+PROGRAM = r"""
+import re
 import sys
 from types import SimpleNamespace
 
@@ -30,7 +31,8 @@ for module in (numba.cuda.compiler, numba.cuda.dispatcher):
 def compiled(kernel, blocks, *given):
     types = tuple(typeof(value.numpy() if isinstance(value, torch.Tensor) else value) for value in given)
     code, _ = cuda.compile_ptx(kernel.py_func, types, cc=capability)
-    print(kernel.py_func.__name__, code.count(".f64"))
+    unordered = re.findall(r"\b(?:atom|red)[.a-z0-9]*[.]f(?:16|32|64)", code)
+    print(kernel.py_func.__name__, code.count(".f64"), len(unordered))
 
 
 launch.MEMORY, launch.run = torch.device("cpu"), compiled
@@ -53,7 +55,7 @@ masks = [np.ones((50, 70), bool)]
 count_hits(scene(5), [camera()], masks, near=0.05, options=LabelOptions(), device="cuda")
 photometric_loss(*np.zeros((2, 3, 9, 9), np.float32), options=PhotometricOptions(), device="cuda")
 model, bounds = Model(scene(5)), Bounds(np.zeros(3), 2.0, 0.05)
-rows = rows_cuda.RowsOnGpu(model, np.ones(5, bool), choose_quantizer(model.gaussians, bounds, 3))
+rows = rows_cuda.RowsOnGpu(model, np.ones(5, bool), bounds, choose_quantizer(model.gaussians, bounds, 3))
 rates = rows_cuda.rates_of(Rates(), model.gaussians, radius=1.0, progress=0.0)
 rows.step(rows.masters, rates, rows.rows, 1)
 held = ShotOnGpu(Shot(camera(), np.zeros((3, 50, 70), np.float32)))
@@ -76,10 +78,13 @@ def compiler() -> bool:
 @pytest.mark.slow
 @needs("nvvm", compiler(), "no numba-cuda with the compiler of CUDA 12 or 13")
 @pytest.mark.parametrize("capability", ["7 5", "9 0"])
-def test_every_kernel_compiles_and_blending_needs_no_double_precision(capability):
+def test_every_kernel_compiles_sums_in_one_order_and_blending_needs_no_double_precision(capability):
+    """Floats that threads add to one place as they come would be another sum each time."""
     command = [sys.executable, "-c", PROGRAM, *capability.split()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
-    doubles = {name: int(count) for name, count in map(str.split, done.stdout.splitlines())}
+    lines = [line.split() for line in done.stdout.splitlines()]
+    doubles = {name: int(count) for name, count, _ in lines}
+    assert all(unordered == "0" for _, _, unordered in lines)
     assert {name for name, count in doubles.items() if count} == DOUBLE
     assert {name for name, count in doubles.items() if not count} == SINGLE
