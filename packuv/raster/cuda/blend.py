@@ -56,6 +56,11 @@ if SIMULATED:  # which has no warps
     def _add_over_warp(sums, entry, warp, lane, k, value):
         cuda.atomic.add(sums, (entry, warp, k), value)
 
+    @cuda.jit(device=True)
+    def _add_ten_over_warp(sums, entry, warp, lane, v0, v1, v2, v3, v4, v5, v6, v7, v8, v9):
+        for k, value in enumerate((v0, v1, v2, v3, v4, v5, v6, v7, v8, v9)):
+            cuda.atomic.add(sums, (entry, warp, k), value)
+
 else:
 
     @cuda.jit(device=True)
@@ -71,6 +76,31 @@ else:
             step >>= 1
         if lane == 0:
             sums[entry, warp, k] += value
+
+    @cuda.jit(device=True)
+    def _halved(low, high, lane, step):
+        """Of a pair of lanes `step` apart the upper one goes on with `high`, the lower one with `low`, each with what
+        both have of it."""
+        upper = lane & step != 0
+        kept, given = (high, low) if upper else (low, high)
+        return kept + cuda.shfl_xor_sync(_EVERYONE, given, step)
+
+    @cuda.jit(device=True)
+    def _add_ten_over_warp(sums, entry, warp, lane, v0, v1, v2, v3, v4, v5, v6, v7, v8, v9):
+        """As `_add_over_warp` of ten values, the sums of which are found in 16 exchanges instead of 50.
+
+        In each step a lane halves the number of sums that it works at, until it has one with the lane beside it.
+        """
+        a0, a1, a2 = _halved(v0, v8, lane, 16), _halved(v1, v9, lane, 16), _halved(v2, _ZERO, lane, 16)
+        a3, a4, a5 = _halved(v3, _ZERO, lane, 16), _halved(v4, _ZERO, lane, 16), _halved(v5, _ZERO, lane, 16)
+        a6, a7 = _halved(v6, _ZERO, lane, 16), _halved(v7, _ZERO, lane, 16)
+        b0, b1 = _halved(a0, a4, lane, 8), _halved(a1, a5, lane, 8)
+        b2, b3 = _halved(a2, a6, lane, 8), _halved(a3, a7, lane, 8)
+        total = _halved(_halved(b0, b2, lane, 4), _halved(b1, b3, lane, 4), lane, 2)
+        total += cuda.shfl_xor_sync(_EVERYONE, total, 1)
+        k = lane >> 1
+        if lane & 1 == 0 and k < SUMS:
+            sums[entry, warp, k] += total
 
 
 @cuda.jit(device=True)
@@ -249,16 +279,8 @@ def blend_backward(record, gaussians, masks, slots, start, tiles, used_end, tile
                 transmittance -= weight
             if chosen[k] != 0 and _any_in_warp(weight != _ZERO):
                 vx, vy = v * dx, v * dy
-                _add_over_warp(sums, k, warp, lane, 0, v)
-                _add_over_warp(sums, k, warp, lane, 1, vx)
-                _add_over_warp(sums, k, warp, lane, 2, vy)
-                _add_over_warp(sums, k, warp, lane, 3, vx * dx)
-                _add_over_warp(sums, k, warp, lane, 4, vx * dy)
-                _add_over_warp(sums, k, warp, lane, 5, vy * dy)
-                _add_over_warp(sums, k, warp, lane, 6, weight * d_red)
-                _add_over_warp(sums, k, warp, lane, 7, weight * d_green)
-                _add_over_warp(sums, k, warp, lane, 8, weight * d_blue)
-                _add_over_warp(sums, k, warp, lane, 9, weight * d_far)
+                _add_ten_over_warp(sums, k, warp, lane, v, vx, vy, vx * dx, vx * dy, vy * dy,
+                                   weight * d_red, weight * d_green, weight * d_blue, weight * d_far)  # fmt: skip
         if transmittance > TRANSMITTANCE_MIN:
             living[block] = 1
         cuda.syncthreads()
