@@ -46,20 +46,25 @@ def idle(hits: Callable[[int], np.ndarray]) -> Iterator[list[Launch]]:
 
 
 class Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch types none of it
-    """What torch does meanwhile: its operations by name, and bytes of tensors that are alive, now and at most."""
+    """What torch does meanwhile: operations by name and bytes that they read and write, but for those that only look at
+    memory in another way; bytes of tensors that are alive, now and at most; and copies to the GPU."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]  # likewise
         self.operations: Counter[str] = Counter()
-        self.alive_bytes = self.most_bytes = 0
+        self.alive_bytes = self.most_bytes = self.moved_bytes = self.uploads = 0
         self._known: set[int] = set()
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         found = operation(*args, **(kwargs or {}))
-        self.operations[operation.overloadpacket.__name__] += 1
-        for tensor in tree_leaves(found):
-            if isinstance(tensor, Tensor):
-                self._see(tensor.untyped_storage())
+        made = [value for value in tree_leaves(found) if isinstance(value, Tensor)]
+        for tensor in made:
+            self._see(tensor.untyped_storage())
+        self.uploads += operation.overloadpacket.__name__ == "lift_fresh"  # with which `torch.tensor` ends
+        if not operation.is_view:
+            self.operations[operation.overloadpacket.__name__] += 1
+            given = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+            self.moved_bytes += sum(tensor.nbytes for tensor in (*given, *made))
         return found
 
     def _see(self, storage: Any) -> None:
