@@ -62,11 +62,11 @@ class GpuMemory:
 
     needed_bytes: int
     layers_bytes: int = 0
-    """Besides, if the backdrop's layers of all cameras stay; what does not fit is composed anew for each picture"""
+    """Of the backdrop's layers of all cameras, if they stay; what does not fit is composed anew for each picture"""
 
     @property
     def all_bytes(self) -> int:
-        return self.needed_bytes + self.layers_bytes
+        return self.needed_bytes + round(HELD * self.layers_bytes)
 
 
 class GpuFullError(RuntimeError):
@@ -106,7 +106,7 @@ def alive_bytes(load: FitLoad) -> int:
 def fit_memory(load: FitLoad, *, budget_bytes: int) -> GpuMemory:
     """What a fit takes of a GPU; layers stay as far as the budget goes."""
     layers = len(load.sides) * _layer_bytes(load.backdrop, pairs(load)[1])
-    return GpuMemory(BASE_BYTES + round(HELD * alive_bytes(load)), round(HELD * min(layers, budget_bytes)))
+    return GpuMemory(BASE_BYTES + round(HELD * alive_bytes(load)), min(layers, budget_bytes))
 
 
 def pairs(load: FitLoad) -> tuple[int, int]:
@@ -123,8 +123,8 @@ def reserve(memory: GpuMemory) -> int:
     layers. Raises GpuFullError where less is free, also because others have reserved it meanwhile."""
     free, _ = memory_of_gpu()
     needed = memory.needed_bytes
-    room = min(memory.layers_bytes, max(0, free - needed))
-    if needed > free or not _hold(needed + room - BASE_BYTES):
+    room = min(memory.layers_bytes, max(0, round((free - needed) / HELD)))
+    if needed > free or not _hold(needed - BASE_BYTES + round(HELD * room)):
         raise GpuFullError(f"needs {needed / 1e9:.1f} GB, {memory_of_gpu()[0] / 1e9:.1f} GB are free")
     return room
 

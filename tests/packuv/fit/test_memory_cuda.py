@@ -125,7 +125,7 @@ def test_a_frame_over_a_backdrop_takes_what_was_foreseen(size, share, kept):
     sides = [(size.width, size.height)] * len(shots)
     own_pairs, layer_pairs = (int(hits[len(part)].sum()) for part in (own, still))
     load = FitLoad(sides, len(own), len(still), 0, DEPTHS, own_pairs=own_pairs, layer_pairs=layer_pairs)
-    layers = fit_memory(load, budget_bytes=budget.total_bytes).layers_bytes / HELD
+    layers = fit_memory(load, budget_bytes=budget.total_bytes).layers_bytes
     one = layers / len(shots)
     assert_foreseen(load, most() - round(layers - one if kept else 0))
 

@@ -192,7 +192,7 @@ ANEW = "those that do not stay are composed anew for each picture"
     ("free", "most", "notes"),
     [
         (9.0, 10**10, {"on_gpu": True, "kept": 2_000_000_000, "device": "cuda"}),
-        (5.5, 10**10, {"on_gpu": True, "kept": 500_000_000, "device": "cuda",
+        (5.6, 10**10, {"on_gpu": True, "kept": 500_000_000, "device": "cuda",
                        "less_gpu": f"it has room for 0.5 GB of them; {ANEW}"}),
         (9.0, 0, {"on_gpu": True, "kept": 0, "device": "cuda",
                   "less_gpu": f"its memory was used up (CUDA out of memory.); {ANEW}"}),
