@@ -26,6 +26,7 @@ BENCHMARKS = (
     "forecast",
     "front_end",
     "gpu",
+    "gpu_model",
     "kills",
     "long",
     "masks",

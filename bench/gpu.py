@@ -40,6 +40,7 @@ from packuv.files import save_json
 from packuv.fit import resident, rows_cuda, shots_cuda
 from packuv.fit.device import compared_differently, drawn_differently, labelled_differently
 from packuv.fit.frames import fit_segment
+from packuv.fit.gpu_memory import FitLoad, alive_bytes
 from packuv.fit.keyframe import KeyState, choose_quantizer
 from packuv.fit.lift import LiftOptions
 from packuv.fit.model import Model
@@ -165,6 +166,7 @@ def measure_iteration(size: FitSize, options: GpuOptions) -> dict[str, Any]:
         "cpu_ms": 1000 * step_seconds(size),
         "gsplat_draw_and_gradients_ms": _by_gsplat(gaussians, shot.camera),
         "memory_bytes": 0 if SIMULATED else torch.cuda.max_memory_allocated(),
+        "memory_foreseen_bytes": alive_bytes(FitLoad([(size.width, size.height)] * len(shots), len(gaussians))),
     }
 
 

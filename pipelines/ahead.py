@@ -87,6 +87,8 @@ class Ahead:
     """Had nothing been there"""
     moving: float | None
     """Share of the pictures' tiles that something moves in"""
+    device: str
+    """Who fits, cpu or cuda"""
     root: Path
     """Of the store"""
 
@@ -94,6 +96,11 @@ class Ahead:
     def minutes(self) -> float:
         """That are left."""
         return sum(step.minutes for step in self.steps)
+
+    @property
+    def gpu_bytes(self) -> float:
+        """Of the memory of a GPU, for the largest fit; 0 where none fits."""
+        return self.forecast.gpu_bytes if self.device == "cuda" else 0
 
     def check_room(self) -> None:
         """Raise OSError (no space) where the disk cannot hold what is left to write."""
@@ -133,6 +140,7 @@ def look_ahead(request: RunRequest, *, progress: Progress = no_progress) -> Ahea
         tuple(_unknown(options, size, machine, request.target_psnr is not None)),
         expected,
         machine.probe.moving,
+        plan.device,
         root,
     )
 

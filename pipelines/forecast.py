@@ -12,6 +12,7 @@ from pathlib import Path
 
 from calibration.importers import holds_lenses_alone
 from packuv.budget import USUAL_BYTES
+from packuv.fit.gpu_memory import FitLoad, fit_memory
 from packuv.fit.pace import FitSize
 from packuv.motion.step import fitted_size
 from packuv.progress import Progress, no_progress
@@ -161,6 +162,8 @@ class Forecast:
     """By stage, see `pipelines.request.STAGES`"""
     memory_bytes: float
     """Of the largest job"""
+    gpu_bytes: float
+    """Of the largest fit, where a GPU does it"""
     disk_bytes: float
     """Of the store"""
     scene_bytes: float
@@ -336,6 +339,7 @@ def forecast(size: Size, options: SequenceOptions, machine: Machine, stop_after:
     return Forecast(
         seconds,
         memory_of(size, options, machine.memory_bytes),
+        gpu_memory_of(size, options, machine.memory_bytes) if "fit" in wanted else 0,
         store_bytes(size, options) if "flow" in wanted else 0,
         scene_bytes(size, options, _moving(machine.probe)) if "encode" in wanted else 0,
         size.frames,
@@ -357,6 +361,16 @@ def memory_of(size: Size, options: SequenceOptions, most: int) -> float:
     filmed = sum(width * height for width, height in size.fitted)
     largest = max(_mpx([shape], options) for shape in size.fitted)
     return BASE_BYTES + held + DECODER_BYTES * filmed + WORKING_BYTES * 1e6 * largest
+
+
+def gpu_memory_of(size: Size, options: SequenceOptions, most: int) -> float:
+    """Bytes that the largest fit takes of a GPU, with its layers as far as `most` goes; see `packuv.fit.gpu_memory`."""
+    fit, sides = options.fit, [_fitted(*side, options.pictures) for side in size.fitted]
+    cap = fit.density.cap
+    still = round(fit.backdrop_share * cap) if fit.background.instants else 0
+    first = FitLoad(sides, still or cap, sh_degree=fit.sh_degree, depths=fit.shell.places)
+    then = FitLoad(sides, cap - still + fit.spare, still, fit.sh_degree)
+    return max(fit_memory(load, budget_bytes=most).all_bytes for load in (first, then))
 
 
 def store_bytes(size: Size, options: SequenceOptions) -> float:

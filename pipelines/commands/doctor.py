@@ -69,7 +69,14 @@ def _fit_on_gpu() -> tuple[bool, str]:
 def _gpu() -> tuple[bool, str]:
     if (query := shutil.which("nvidia-smi")) is None:
         return False, "no NVIDIA driver; the CPU does everything"
-    command = [query, "--query-gpu=name,memory.total", "--format=csv,noheader"]
+    command = [query, "--query-gpu=name,memory.total,memory.free", "--format=csv,noheader,nounits"]
     answer = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
-    names = "; ".join(answer.stdout.splitlines())
-    return bool(names), names or "a driver, but no GPU"
+    found = "; ".join(_gpu_text(*line.rsplit(", ", 2)) for line in answer.stdout.splitlines())
+    return bool(found), found or "a driver, but no GPU"
+
+
+def _gpu_text(name: str, total_mib: str, free_mib: str) -> str:
+    if not (total_mib.isdigit() and free_mib.isdigit()):  # of memory that is the CPU's the driver does not tell
+        return name
+    total, free = (size_text(int(mib) * 2**20) for mib in (total_mib, free_mib))
+    return f"{name}: {total} of memory, {free} of them free"

@@ -68,6 +68,7 @@ def to_json(ahead: Ahead) -> dict[str, Any]:
         "minutes_left": _within(ahead.minutes, TIME_WITHIN),
         "minutes_in_all": _within(expected.minutes, TIME_WITHIN),
         "memory_bytes": round(expected.memory_bytes),
+        "gpu_memory_bytes": round(ahead.gpu_bytes),
         "disk_bytes": {"store": round(expected.disk_bytes), "to_write": round(ahead.missing_bytes)},
         "disk_free_bytes": ahead.free_bytes,
         "mb_per_frame": _within(expected.mb_per_frame, SIZE_WITHIN),
@@ -101,6 +102,8 @@ def _lines(ahead: Ahead) -> Iterator[str]:
     least, most = (minutes_text(ahead.minutes * factor) for factor in (1 / TIME_WITHIN, TIME_WITHIN))
     yield f"time       {least} to {most}" if ahead.minutes else "time       none: all is there"
     yield f"memory     {size_text(expected.memory_bytes)} for the largest job"
+    if ahead.gpu_bytes:
+        yield _gpu_line(ahead.gpu_bytes)
     yield f"disk       {size_text(ahead.missing_bytes)} more at most, {size_text(ahead.free_bytes)} are free"
     if expected.scene_bytes:
         mb, least_mb, most_mb = (expected.mb_per_frame * factor for factor in (1, 1 / SIZE_WITHIN, SIZE_WITHIN))
@@ -109,6 +112,14 @@ def _lines(ahead: Ahead) -> Iterator[str]:
         yield f"moves      {100 * ahead.moving:.0f} % of the pictures, as a few of them tell"
     yield from (f"spared     {what}: {why}" for what, why in ahead.spared)
     yield from (f"left out   {what}" for what in ahead.unknown)
+
+
+def _gpu_line(needed: float) -> str:
+    from packuv.fit.gpu_memory import memory_of_gpu
+
+    free, total = memory_of_gpu()
+    less = "; the CPU does what does not fit" if needed > free else ""
+    return f"GPU        {size_text(needed)} for the largest fit, {size_text(free)} of {size_text(total)} are free{less}"
 
 
 def _many(arguments: argparse.Namespace) -> int:

@@ -20,17 +20,22 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from packuv.budget import USUAL_BYTES
 from packuv.progress import Progress
 from tasks.artefacts.store import Key, Store
+
+if TYPE_CHECKING:
+    from packuv.fit.gpu_memory import GpuMemory
 
 BASE_BYTES = 1_000_000_000
 """Of a job beside pictures and layers: the libraries, the Gaussians and what the optimizer keeps of them"""
 
 NO_GPU = "no_gpu"
 """Note of a job that should have used a GPU: why it did not"""
+LESS_GPU = "less_gpu"
+"""Note of a job that kept less on the GPU than it could have used: why"""
 
 Notes = Mapping[str, Any]
 """What a stage says about its work, for the receipt; plain values"""
@@ -119,6 +124,10 @@ class Stage(ABC):
             return Needs(1, BASE_BYTES)
         return Needs(site.threads, site.memory_bytes + BASE_BYTES, int(self.on_gpu))
 
+    def gpu_memory(self, work: Work) -> GpuMemory | None:
+        """What its job takes of a GPU; None where nobody has counted it."""
+        return None
+
     @property
     def on_gpu(self) -> bool:
         """Whether it or its options say so."""
@@ -168,20 +177,54 @@ class StageJob:
         if not self.stage.on_gpu:
             return self.stage.build(work)
         try:
-            return {**self.stage.build(work), "device": "cuda"}
+            return {**self._on_gpu(work), "device": "cuda"}
         except Exception as error:  # of whichever library asked for the memory
-            if not _gpu_is_full(error):
+            why = _why_too_little(error)
+            if why is None:
                 raise
-            why = f"its memory was used up ({str(error).splitlines()[0]}), so the CPU did it"
+        self._start_over()
+        return {**self.stage.on_cpu.build(work), "device": "cpu", NO_GPU: f"{why}, so the CPU did it"}
+
+    def _on_gpu(self, work: Work) -> Notes:
+        """With as many layers as there is room for; where the memory is used up nevertheless, once more with none."""
+        from packuv.fit.gpu_memory import reserve  # late, for it takes a second to load
+
+        memory = self.stage.gpu_memory(work)
+        room = 0 if memory is None else reserve(memory)
+        try:
+            if memory is None or room == memory.layers_bytes:
+                return self.stage.build(work)
+            return self._with_less(work, room, f"it has room for {room / 1e9:.1f} GB of them")
+        except Exception as error:
+            why = _why_too_little(error)
+            if why is None or not room:
+                raise
+        self._start_over()
+        return self._with_less(work, 0, why)
+
+    def _with_less(self, work: Work, room: int, why: str) -> Notes:
+        """With so many bytes for layers, and so for all that can be made again."""
+        site = replace(work.site, memory_bytes=min(work.site.memory_bytes, room))
+        told = f"{why}; those that do not stay are composed anew for each picture"
+        return {**self.stage.build(replace(work, site=site)), LESS_GPU: told}
+
+    def _start_over(self) -> None:
+        """Without what a failed attempt left."""
+        from packuv.fit.gpu_memory import let_go
+
+        let_go()
         for left in self.out.iterdir():
             shutil.rmtree(left) if left.is_dir() else left.unlink()
-        return {**self.stage.on_cpu.build(work), "device": "cpu", NO_GPU: why}
 
 
-def _gpu_is_full(error: Exception) -> bool:
-    from packuv.fit.device import gpu_is_full  # late, for it takes a second to load
+def _why_too_little(error: Exception) -> str | None:
+    """What an error says of the GPU's memory; None where it tells of something else."""
+    from packuv.fit.device import gpu_is_full
+    from packuv.fit.gpu_memory import GpuFullError
 
-    return gpu_is_full(error)
+    if isinstance(error, GpuFullError):
+        return f"it {error}"
+    return f"its memory was used up ({str(error).splitlines()[0]})" if gpu_is_full(error) else None
 
 
 def _names_artefacts(value: Any) -> bool:

@@ -13,7 +13,7 @@ from packuv.progress import Progress, no_progress
 from sync.capture import Capture
 from tasks.artefacts.jobs import Jobs, end_leftovers
 from tasks.artefacts.originals import Originals
-from tasks.artefacts.stage import NO_GPU, Files, Notes, Site, Stage, StageJob
+from tasks.artefacts.stage import LESS_GPU, NO_GPU, Files, Notes, Site, Stage, StageJob
 from tasks.artefacts.store import Building, Key, Store
 
 
@@ -99,6 +99,8 @@ class Workshop:
             self.listener.skipped(what, why)
         if NO_GPU in notes:
             self.listener.skipped(f"GPU for {stage.label}", notes[NO_GPU])
+        if LESS_GPU in notes:
+            self.listener.skipped(f"keeping layers on the GPU for {stage.label}", notes[LESS_GPU])
         return key
 
     def path(self, key: Key) -> Path:

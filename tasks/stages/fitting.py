@@ -16,6 +16,7 @@ from packuv.budget import Budget
 from packuv.files import save_json
 from packuv.fit.bands import told
 from packuv.fit.frames import fit_segment
+from packuv.fit.gpu_memory import FitLoad, GpuMemory, fit_memory
 from packuv.fit.keyframe import KeyState, enough_stands_still, fit_backdrop, fit_first, fit_next
 from packuv.fit.options import FirstOptions, FrameOptions, NextOptions
 from packuv.fit.patch import fit_patch, whole_places
@@ -120,6 +121,10 @@ class FitBackdrop(Stage):
     def label(self) -> str:
         return "fit backdrop"
 
+    def gpu_memory(self, work: Work) -> GpuMemory:
+        cap = round(self.options.backdrop_share * self.options.density.cap)
+        return _first_memory(work, self.take, self.options, cap)
+
     def build(self, work: Work) -> Notes:
         views = Footage(self.take, work.site).open_views(spill=work.scratch)
         state = fit_backdrop(
@@ -190,6 +195,9 @@ class PatchBackdrop(Stage):
     def label(self) -> str:
         return f"patch backdrop for epoch {self.epoch + 1}"
 
+    def gpu_memory(self, work: Work) -> GpuMemory:
+        return _next_memory(work, self.take, KeyState.load(work.path(self.previous)), self.options.density.cap)
+
     def build(self, work: Work) -> Notes:
         views = Footage(self.take, work.site).open_views(spill=work.scratch)
         state = fit_patch(
@@ -216,6 +224,9 @@ class FitFirst(Stage):
     @property
     def label(self) -> str:
         return f"fit keyframe {self.instant}"
+
+    def gpu_memory(self, work: Work) -> GpuMemory:
+        return _first_memory(work, self.take, self.options, self.options.density.cap)
 
     def build(self, work: Work) -> Notes:
         state = fit_first(
@@ -250,6 +261,11 @@ class FitNext(Stage):
     @property
     def label(self) -> str:
         return f"fit keyframe {self.instant}{f' after {self.instant - 1}' if self.end else ''}"
+
+    def gpu_memory(self, work: Work) -> GpuMemory:
+        before = KeyState.load(work.path(self.previous))
+        most = max(self.options.density.cap - before.backdrop, len(before.foreground))
+        return _next_memory(work, self.take, before, most)
 
     def build(self, work: Work) -> Notes:
         before = KeyState.load(work.path(self.previous))
@@ -288,6 +304,10 @@ class FitSegment(Stage):
     @property
     def label(self) -> str:
         return f"fit segment {self.number} (frames {self.span[0]}-{self.span[1] - 1})"
+
+    def gpu_memory(self, work: Work) -> GpuMemory:
+        key = KeyState.load(work.path(self.key))
+        return _next_memory(work, self.take, key, len(key.foreground) + self.options.spare)
 
     def build(self, work: Work) -> Notes:
         segment, figures = fit_segment(
@@ -380,6 +400,22 @@ def read_losses(folder: Path) -> list[float]:
     """Loss of each frame after a segment's keyframe, NaN where nothing moved."""
     frames = json.loads((folder / FIGURES).read_text())["frames"]
     return [frame.get("loss", math.nan) for frame in frames]
+
+
+def _first_memory(work: Work, take: Take, options: FirstOptions, gaussians: int) -> GpuMemory:
+    """Of a fit that starts from nothing."""
+    load = FitLoad(_sides(work, take), gaussians, sh_degree=options.sh_degree, depths=options.shell.places)
+    return fit_memory(load, budget_bytes=work.site.memory_bytes)
+
+
+def _next_memory(work: Work, take: Take, before: KeyState, gaussians: int) -> GpuMemory:
+    """Of a fit that starts from a keyframe or the backdrop, of which so many may change."""
+    load = FitLoad(_sides(work, take), gaussians, before.backdrop, before.quantizer.sh_degree)
+    return fit_memory(load, budget_bytes=work.site.memory_bytes)
+
+
+def _sides(work: Work, take: Take) -> list[tuple[int, int]]:
+    return [(camera.width, camera.height) for camera in Footage(take, work.site).open_views().cameras]
 
 
 def _spared_bands(notes: Notes) -> Iterator[tuple[str, str]]:

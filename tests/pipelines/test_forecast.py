@@ -57,6 +57,7 @@ def test_more_frames_cameras_or_pixels_never_take_less(size, machine, name):
         found = forecast(other, POINTS[name], machine)
         assert found.minutes >= now.minutes * (1 - 1e-12)
         assert found.memory_bytes >= now.memory_bytes
+        assert found.gpu_bytes >= now.gpu_bytes > 10**9
         assert found.disk_bytes >= 0.98 * now.disk_bytes  # heights of flow are rounded
         assert found.scene_bytes >= now.scene_bytes
     assert pilot_minutes(size, POINTS[name], machine, 6) > 0

@@ -73,6 +73,11 @@ class ShellOptions:
                 f"farthest, but has {self.window}, {self.columns}, {self.steps}, {self.nearest} and {self.farthest}"
             )
 
+    @property
+    def places(self) -> int:
+        """Depths that a camera may learn from it."""
+        return self.columns * self.columns // 2 * self.enabled
+
 
 @dataclass(frozen=True)
 class Shell:

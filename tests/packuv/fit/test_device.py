@@ -25,7 +25,8 @@ from tests.support.places import ROOT
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tests", ["raster/test_cuda.py", "fit/test_cuda.py", "fit/test_rows_cuda.py",
-                                   "fit/test_density_cuda.py", "fit/test_resident.py"])  # fmt: skip
+                                   "fit/test_density_cuda.py", "fit/test_resident.py",
+                                   "fit/test_memory_cuda.py"])  # fmt: skip
 def test_the_cuda_kernels_do_what_the_cpus_do_in_the_simulator(tests):
     """In an interpreter of its own, since numba reads the switch when it is imported."""
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": str(ROOT)}

@@ -72,6 +72,25 @@ def test_what_is_ahead_shrinks_as_a_run_goes_on(tmp_path, capsys):
     assert rows["scene file"]["fact"] == (folder / "scene.mkv").stat().st_size / 1e6
 
 
+@pytest.mark.parametrize(("free", "told"), [(9, "are free\n"), (1, "are free; the CPU does what does not fit\n")])
+def test_where_a_gpu_fits_its_memory_is_planned_too(tmp_path, capsys, monkeypatch, free, told):
+    """Without it nobody asks how much there is."""
+    assert planned(tmp_path, capsys)["gpu_memory_bytes"] == 0
+    assert "GPU" not in whole_plan(tmp_path, capsys)
+    monkeypatch.setattr("pipelines.process.choose_device", lambda asked: "cuda")
+    monkeypatch.setattr("packuv.fit.gpu_memory.memory_of_gpu", lambda: (free * 10**9, 10**10))
+    needed = planned(tmp_path, capsys)["gpu_memory_bytes"]
+    assert 1e9 < needed < 2e9
+    text = whole_plan(tmp_path, capsys)
+    assert f"GPU        {needed / 1e9:.1f} GB for the largest fit, {free}.0 GB of 10.0 GB {told}" in text
+
+
+def whole_plan(out: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """What `packuv plan` says to people."""
+    assert main(["plan", str(CAPTURE), "--out", str(out), *HOW]) == OK
+    return capsys.readouterr().out
+
+
 def test_what_the_disk_cannot_hold_is_the_last_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(space, "free_bytes", lambda path: 1000)
     assert main(["plan", str(CAPTURE), "--out", str(tmp_path), *HOW]) == FAILED

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from packuv.fit import gpu_memory
+from packuv.fit.gpu_memory import GpuMemory
 from packuv.fit.options import FitOptions
 from packuv.progress import no_progress
 from tasks.artefacts.jobs import JobDiedError, JobError
@@ -163,6 +165,50 @@ def test_where_the_gpus_memory_is_used_up_the_cpu_goes_on_and_it_is_told(site, t
     assert notes["no_gpu"] == (
         "its memory was used up (CUDA out of memory. Tried to allocate 9 GiB.), so the CPU did it"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counted(Fit):
+    """Needs 5 GB of a GPU, and 1 GB for layers; finds its memory used up as long as it may keep more than `most`."""
+
+    most: int = 10**10
+
+    def gpu_memory(self, work):
+        return GpuMemory(5 * 10**9, 10**9)
+
+    def build(self, work):
+        on_gpu, kept = self.options.device == "cuda", work.site.memory_bytes
+        assert not list(work.out.iterdir())
+        (work.out / "left").write_text("here")
+        if on_gpu and kept > self.most:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return {"on_gpu": on_gpu, "kept": kept}
+
+
+ANEW = "those that do not stay are composed anew for each picture"
+
+
+@pytest.mark.parametrize(
+    ("free", "most", "notes"),
+    [
+        (9.0, 10**10, {"on_gpu": True, "kept": 2_000_000_000, "device": "cuda"}),
+        (5.6, 10**10, {"on_gpu": True, "kept": 500_000_000, "device": "cuda",
+                       "less_gpu": f"it has room for 0.5 GB of them; {ANEW}"}),
+        (9.0, 0, {"on_gpu": True, "kept": 0, "device": "cuda",
+                  "less_gpu": f"its memory was used up (CUDA out of memory.); {ANEW}"}),
+        (9.0, -1, {"on_gpu": False, "kept": 2_000_000_000, "device": "cpu",
+                   "no_gpu": "its memory was used up (CUDA out of memory.), so the CPU did it"}),
+        (4.0, 10**10, {"on_gpu": False, "kept": 2_000_000_000, "device": "cpu",
+                       "no_gpu": "it needs 5.0 GB, 4.0 GB are free, so the CPU did it"}),
+    ],
+    ids=["all", "fewer layers", "no layers after all", "the CPU after all", "the CPU at once"],
+)  # fmt: skip
+def test_a_fit_keeps_on_the_gpu_what_there_is_room_for(site, tmp_path, monkeypatch, free, most, notes):
+    monkeypatch.setattr(gpu_memory, "memory_of_gpu", lambda: (round(free * 1e9), 10**10))
+    monkeypatch.setattr(gpu_memory, "_hold", lambda size: True)
+    (tmp_path / "out").mkdir()
+    stage = Counted(options=FitOptions(device="cuda"), most=most)
+    assert StageJob(stage, site, tmp_path / "out", tmp_path)(no_progress) == notes
 
 
 def test_other_errors_on_a_gpu_are_raised(site, tmp_path):
