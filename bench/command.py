@@ -35,6 +35,7 @@ BENCHMARKS = (
     "page",
     "pareto",
     "raster",
+    "reading",
     "scaling",
     "sequence",
     "size",

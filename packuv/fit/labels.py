@@ -157,7 +157,8 @@ def active_tiles(
         return np.ones((rows, columns), dtype=bool)
     _check_picture(mask, camera, "mask")
     padded = np.pad(mask, ((0, rows * TILE - camera.height), (0, columns * TILE - camera.width)))
-    tiles = np.asarray(padded.reshape(rows, TILE, columns, TILE).any(axis=(1, 3)))
+    by_row = padded.reshape(rows, TILE, columns * TILE).any(axis=1)  # at once over both axes takes seven times as long
+    tiles = np.asarray(by_row.reshape(rows, columns, TILE).any(axis=2))
     reach = np.sqrt(2 * np.log(np.maximum(opacity(moving) * (1 / ALPHA_MIN), 1)))  # in standard deviations, [N]
     _touch(moving.means, _shapes(moving), _visible(moving), reach, view_constants(camera, near, low_pass_px2), tiles)
     return tiles
