@@ -45,7 +45,7 @@ def on_device(array: np.ndarray) -> Tensor:
 def send(array: np.ndarray) -> Callable[[], Tensor]:
     """Begin to copy an array for kernels, beside what they do; the function that it returns gives the copy, and has
     kernels from then on wait for it. Any thread may send."""
-    if SIMULATED:
+    if MEMORY.type == "cpu":
         there = on_device(array)
         return lambda: there
     here = torch.tensor(array).pin_memory()  # which torch leaves alone until it has been copied

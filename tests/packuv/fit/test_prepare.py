@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import threading
+from contextlib import contextmanager
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+import torch
 
 from packuv.budget import Budget
 from packuv.fit.prepare import Instant, prepared
 from packuv.fit.shots import Sent, find_shots
 from packuv.footage import FrameReader, LensCamera, Views
 from packuv.motion import MotionCache, MotionOptions, measure_motion
+from packuv.raster.cuda import launch
 
 ROWS = range(1, 5)
 CAMERAS = 4
@@ -206,3 +209,44 @@ def test_an_interrupt_waits_for_what_is_under_way_only(videos, ring, motion):
         fit()
     assert sum(2 in frames for frames in reader.read_frames.values()) == 1
     assert not ours()
+
+
+def test_a_picture_travels_beside_the_kernels_which_wait_for_it(monkeypatch):
+    """With torch's streams replaced, since no GPU is here: what is asked of which, in order."""
+    asked = list[str]()
+
+    class Stream:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def record_event(self) -> str:
+            asked.append(f"an event of {self.name}")
+            return f"event of {self.name}"
+
+        def wait_event(self, event: str) -> None:
+            asked.append(f"{self.name} waits for {event}")
+
+    @contextmanager
+    def on(stream: Stream):
+        asked.append(f"to {stream.name}")
+        yield
+        asked.append(f"from {stream.name}")
+
+    def to(tensor, device, *, non_blocking: bool):
+        asked.append(f"copy to {device}, {'without' if non_blocking else 'with'} waiting")
+        return tensor.clone()
+
+    kernels, aside = Stream("kernels"), Stream("copies")
+    monkeypatch.setattr(launch, "MEMORY", torch.device("cuda"))
+    monkeypatch.setattr(launch, "_aside", lambda: aside)
+    monkeypatch.setattr(torch.cuda, "stream", on)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: kernels)
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda tensor: asked.append("pin") or tensor)
+    monkeypatch.setattr(torch.Tensor, "to", to)
+    monkeypatch.setattr(torch.Tensor, "record_stream", lambda tensor, stream: asked.append(f"kept for {stream.name}"))
+    pixels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    taken = launch.send(pixels)
+    travel = ["pin", "to copies", "copy to cuda, without waiting", "an event of copies", "from copies"]
+    assert asked == travel
+    assert np.array_equal(taken().numpy(), pixels)
+    assert asked[len(travel) :] == ["kernels waits for event of copies", "kept for kernels"]
