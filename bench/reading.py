@@ -5,8 +5,8 @@
 
 Videos are read in order by one thread, as by each of those that prepare the next instant while a GPU fits this one
 (`packuv.fit.prepare`). Each is undistorted as if its lens were bent, so that this is measured, too; a rig whose videos
-are undistorted spares it. Times are CPU time, medians over all pictures but the first of each video; of decoding it is
-the mean, for frames differ.
+are undistorted spares it. Beside that, what the fit's own thread does with each mask before it iterates. Times are CPU
+time, medians over all pictures but the first of each video; of decoding it is the mean, for frames differ.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ import torch
 from bench.command import parser
 from packuv.camera import PinholeCamera
 from packuv.each import packed
+from packuv.fit.labels import active_tiles
 from packuv.footage import FrameReader, LensCamera, Views, develop, exact
+from packuv.gaussians.floats import Gaussians
 from packuv.kernels.simd import cpu_description
 from packuv.motion import MotionOptions, one_opencv_thread
 from packuv.motion.step import fitted_size, grown
@@ -35,8 +37,10 @@ LENS = (-0.1, 0.02, 0.0, 0.0)
 """Made up, radial"""
 CAMERAS, FRAME_SECONDS = 88, 1.5
 """Of the rig, and what its GPU takes for an instant"""
-MOVING_SHARE = 0.1
-"""Of a picture, in the made-up mask"""
+MOVING_SHARE, MOVING = 0.1, 8_000
+"""Of a picture, in the made-up mask, and Gaussians that may change"""
+LOOKS = 3
+"""Times that a fit unpacks a mask before it iterates"""
 
 
 def measure(videos: Sequence[Path], frames: int) -> dict[str, Any]:
@@ -44,6 +48,7 @@ def measure(videos: Sequence[Path], frames: int) -> dict[str, Any]:
     with one_opencv_thread():
         found = [_measure_video(path, frames) for path in videos]
     stages = {name: 1000 * float(np.mean([part[name] for part in found])) for name in found[0]}
+    own = stages.pop("fit")
     straight = sum(ms for name, ms in stages.items() if name != "undistort")
     per_instant = {"as filmed": CAMERAS * sum(stages.values()) / 1000, "undistorted before": CAMERAS * straight / 1000}
     return {
@@ -54,6 +59,7 @@ def measure(videos: Sequence[Path], frames: int) -> dict[str, Any]:
         "cameras": CAMERAS,
         "cpu_seconds_an_instant": per_instant,
         "cores_in_time": {name: seconds / FRAME_SECONDS for name, seconds in per_instant.items()},
+        "ms_of_the_fit_itself": own,
     }
 
 
@@ -66,21 +72,29 @@ def _measure_video(path: Path, frames: int) -> dict[str, float]:
     """Seconds of CPU time by stage."""
     width, height = _size(path)
     camera = PinholeCamera("a", width, height, 0.8 * width, 0.8 * width, width / 2, height / 2, np.eye(4))
-    times: dict[str, list[float]] = {name: [] for name in ("convert", "undistort", "whole", "mask", "copy")}
-    mask = _made_up_mask(width, height)
+    times: dict[str, list[float]] = {name: [] for name in ("convert", "undistort", "whole", "mask", "copy", "fit")}
+    mask, moving = _made_up_mask(width, height), _made_up_gaussians()
+
+    def look(mask: Callable[[], np.ndarray]) -> None:
+        for _ in range(LOOKS):
+            known = mask()
+        active_tiles(known, moving, camera)
+
     with ExitStack() as stack:
         for name, place, function in (("convert", exact, "converted"), ("convert", develop.Developer, "picture"),
                                       ("undistort", cv2, "remap")):  # fmt: skip
             stack.enter_context(patch.object(place, function, _timed(getattr(place, function), times[name])))
         source = Views({"a": path}, np.arange(frames)[:, None], [LensCamera(camera, LENS)])
         source.pixels(0, 0)  # which opens the video, and makes maps of the lens
+        look(packed(np.ones((height, width), bool)))  # which compiles
         for part in times.values():
             part.clear()
         read, copy = _timed(source.pixels, times["whole"]), _timed(torch.tensor, times["copy"])
         enlarge = _timed(lambda: packed(grown(mask, width, height, MotionOptions().dilation_px)), times["mask"])
+        prepare = _timed(look, times["fit"])
         for frame in range(1, frames):
             copy(read(0, frame, remember=False))
-            enlarge()
+            prepare(enlarge())
     median = {name: float(np.median(part)) for name, part in times.items() if name != "whole"}
     rest = np.mean(times["whole"]) - np.mean(times["convert"]) - np.mean(times["undistort"])
     return {"decode": float(rest), **median}
@@ -92,6 +106,14 @@ def _made_up_mask(width: int, height: int) -> np.ndarray:
     mask = np.zeros((height, width), bool)
     mask[: round(height * MOVING_SHARE**0.5), : round(width * MOVING_SHARE**0.5)] = True
     return mask
+
+
+def _made_up_gaussians() -> Gaussians:
+    """A cloud before the camera."""
+    rng = np.random.default_rng(0)
+    arrays = (rng.normal([0, 0, 4], 1, (MOVING, 3)), np.full((MOVING, 3), -4.0), rng.normal(size=(MOVING, 4)),
+              np.zeros(MOVING), np.zeros((MOVING, 1, 3)))  # fmt: skip
+    return Gaussians(*(array.astype(np.float32) for array in arrays))
 
 
 def _timed(function: Callable[..., Any], seconds: list[float]) -> Callable[..., Any]:
