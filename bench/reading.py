@@ -1,12 +1,13 @@
 """CPU time by stage of making one camera's picture ready for a GPU, and what a rig of them takes for an instant.
 
     packuv simulate runs/large --cameras 2 --frames 10 --size 1920x1200 --seed 3
-    packuv bench reading runs/large/videos --out bench/results/reading.json
+    NUMBA_NUM_THREADS=1 packuv bench reading runs/large/videos --out bench/results/reading.json
 
 Videos are read in order by one thread, as by each of those that prepare the next instant while a GPU fits this one
 (`packuv.fit.prepare`). Each is undistorted as if its lens were bent, so that this is measured, too; a rig whose videos
-are undistorted spares it. Beside that, what the fit's own thread does with each mask before it iterates. Times are CPU
-time, medians over all pictures but the first of each video; of decoding it is the mean, for frames differ.
+are undistorted spares it. Beside that, what the fit itself does with each mask before it iterates. Times are CPU time
+(of one thread: NUMBA_NUM_THREADS=1), medians over all pictures but the first of each video; of decoding it is the mean,
+for frames differ.
 """
 
 from __future__ import annotations
