@@ -36,6 +36,7 @@ BENCHMARKS = (
     "page",
     "pareto",
     "raster",
+    "reading",
     "scaling",
     "sequence",
     "size",

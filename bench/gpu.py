@@ -1,4 +1,5 @@
-"""What a GPU does, and how fast: tests, an iteration by stage, a keyframe and frames beside the CPU's, a profile.
+"""What a GPU does, and how fast: tests, an iteration by stage, a profile, pictures on their way to it, a keyframe and
+frames beside the CPU's.
 
     make gpu                                  # or, where nothing is set up: OUT=results bench/gpu.sh
     NUMBA_ENABLE_CUDASIM=1 python -m bench.gpu --toy --out runs/toy     # in numba's simulator, to see that it runs
@@ -24,6 +25,7 @@ import time
 import traceback
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -57,6 +59,7 @@ from packuv.gaussians.floats import Gaussians, arrays
 from packuv.gaussians.segment import Segment
 from packuv.metrics import decibels
 from packuv.raster import RasterOptions, render
+from packuv.raster.cuda import launch
 from packuv.raster.cuda import render as on_gpu
 
 SIMULATED = bool(cast(Any, numba.config).ENABLE_CUDASIM)
@@ -80,6 +83,8 @@ class GpuOptions:
     """Of the sequence, the last one unseen by the fit"""
     key_iterations: int = 1000
     frames: int = 20
+    rig: tuple[int, int, int] = (88, 1920, 1200)
+    """Cameras whose pictures of an instant are sent to the GPU, and the size of these"""
     turn: float = 0.1
     """Radians by which the ball goes on in a frame, on a circle of 0.3"""
     frame_iterations: int = 96
@@ -97,6 +102,7 @@ TOY = GpuOptions(
     cameras=4,
     key_iterations=2,
     frames=2,
+    rig=(2, 16, 12),
     turn=2.0,
     frame_iterations=2,
 )
@@ -211,6 +217,45 @@ def _by_gsplat(gaussians: Gaussians, camera: PinholeCamera) -> float | None:
     for _ in range(6):
         draw()
     return 1000 * float(np.median(seconds[1:]))
+
+
+# Pictures of an instant
+
+
+def measure_pictures(options: GpuOptions, _: Path) -> dict[str, Any]:
+    """How long the pictures of an instant travel, and what an iteration takes while a thread sends them, as it sends
+    those of the next instant in a fit."""
+    cameras, width, height = options.rig
+    pixels, size = np.zeros((height, width, 3), np.uint8), options.sizes[len(options.sizes) // 2]
+    solver, shots = made_up(size, "cuda")
+    solver.run(shots, options.first, of=1000)
+    travel = _seconds(lambda: send_all(pixels, cameras))
+    count = options.iterations // 4 + 1
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(send_all, pixels, cameras)
+        meanwhile = _seconds(lambda: solver.run(shots, count, of=1000))
+    return {
+        "pictures": f"{cameras} of {width}x{height}",
+        "ms": 1000 * travel,
+        "gigabytes_a_second": cameras * pixels.nbytes / travel / 1e9,
+        "iteration": str(size),
+        "iteration_ms_meanwhile": 1000 * meanwhile / count,
+    }
+
+
+def send_all(pixels: np.ndarray, count: int) -> None:
+    """Pin and send a picture so many times; all of them lie on the GPU in the end."""
+    for sent in [launch.send(pixels) for _ in range(count)]:
+        sent()
+
+
+def _seconds(work: Callable[[], Any]) -> float:
+    """Until the GPU has done it, too."""
+    rest()
+    begun = time.perf_counter()
+    work()
+    rest()
+    return time.perf_counter() - begun
 
 
 # A sequence
@@ -422,6 +467,7 @@ PARTS: Sequence[tuple[str, float, Callable[..., Any]]] = (
     ("tests", 0, measure_tests),
     ("iteration", 60, measure_iterations),
     ("profile", 30, measure_profile),
+    ("pictures", 20, measure_pictures),
     ("sequence", 90, measure_sequence),
 )
 """Name, seconds that must be left, and what measures"""

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from packuv.each import as_bits
 from packuv.files import open_npz, save_json, save_npz
 from packuv.fit.backdrop import Backdrop
 from packuv.fit.keyframe import DEAD_CODE, KeyState
 from packuv.fit.lift import lift_motion
 from packuv.fit.model import Model
 from packuv.fit.options import FrameOptions
+from packuv.fit.prepare import Instant, Send, prepared
 from packuv.fit.shots import find_shots, moving_rows
 from packuv.fit.solver import tiled
 from packuv.fit.solvers import open_solver
@@ -41,11 +40,13 @@ def fit_segment(
     motion: MotionCache,
     options: FrameOptions,
     scratch: Path,
+    workers: int = 2,
     progress: Progress = no_progress,
 ) -> tuple[Segment, list[dict[str, Any]]]:
     """Fit the frames of one segment; `instants` starts with the keyframe's own. Also returns figures per frame.
 
-    After every frame the state goes to `scratch`, from which a later call continues with the same result.
+    After every frame the state goes to `scratch`, from which a later call continues with the same result. For a GPU,
+    `workers` threads prepare the next frame meanwhile.
     """
     if instants.start != key.instant:
         raise ValueError(f"a segment starts at its keyframe, instant {key.instant}, not at {instants.start}")
@@ -53,21 +54,23 @@ def fit_segment(
         options = replace(options, rates=replace(options.rates, sh_rest=0.0))
     track, backdrop = Track.resume(key, options.spare, scratch), key.open_backdrop(options.device, views.budget)
     ticks = Ticks(progress, len(instants) - 1, done=len(track.frames))
-    for instant in instants[1 + len(track.frames) :]:
-        views.forget()
-        masks = as_bits(motion.mask(motion.names.index(camera.name), instant) for camera in views.cameras)
-        flows = [_optical_flow(motion, camera.name, instant, options) for camera in views.cameras]
-        track.add(_fit_frame(track.model, key, backdrop, views, instant, masks, flows, options))
-        track.checkpoint()
-        ticks.advance()
+    flows = options.lift.enabled and motion.options.keep_flow  # without, as of hours, Gaussians start where they were
+    rows, send = instants[1 + len(track.frames) :], _sender(options.device)
+    with prepared(views, motion, rows, flows=flows, send=send, workers=workers) as coming:
+        for instant in coming:
+            views.forget()
+            track.add(_fit_frame(track.model, key, backdrop, views, instant, options))
+            track.checkpoint()
+            ticks.advance()
     return track.segment(instants.start), track.figures
 
 
-def _optical_flow(motion: MotionCache, camera: str, instant: int, options: FrameOptions) -> np.ndarray | None:
-    """None also where it was not kept, as of hours: Gaussians then start where they were."""
-    if not (options.lift.enabled and motion.options.keep_flow):
+def _sender(device: str) -> Send | None:
+    if device == "cpu":
         return None
-    return motion.optical_flow(motion.names.index(camera), instant)
+    from packuv.raster.cuda.launch import send  # late, for it needs a GPU's libraries
+
+    return send
 
 
 def _fit_frame(
@@ -75,31 +78,33 @@ def _fit_frame(
     key: KeyState,
     backdrop: Backdrop,
     views: Views,
-    instant: int,
-    masks: Sequence[np.ndarray | None],
-    optical_flows: Sequence[np.ndarray | None],
+    instant: Instant,
     options: FrameOptions,
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Carry the model on to one instant; returns the rows that it changed, bool [N], and figures."""
-    started = time.monotonic()
-    rows = np.zeros(len(model), bool)
+    masks, rows = instant.masks, np.zeros(len(model), bool)
     if not any(mask is not None and mask.any() for mask in masks):
-        return rows, {"instant": instant, "seconds": time.monotonic() - started, "iterations": 0, "dynamic": 0}
-    rng = np.random.default_rng([options.seed, instant, 2])
+        return rows, {
+            "instant": instant.row,
+            "seconds": time.monotonic() - instant.asked,
+            "iterations": 0,
+            "dynamic": 0,
+        }
+    rng = np.random.default_rng([options.seed, instant.row, 2])
     solver = open_solver(model, key.bounds, options, rng, backdrop)
     solver.fix(key.quantizer)
     rows = moving_rows(model.gaussians, key.quantizer, views, masks, key.bounds, options)
-    model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, optical_flows, masks,
+    model.gaussians.means[rows] += lift_motion(model.gaussians.means[rows], views.cameras, instant.optical_flows, masks,
                                                near=key.bounds.near, options=options.lift)  # fmt: skip
     spare = opacity(model.gaussians) <= options.density.min_opacity
     model.forget_moments(np.flatnonzero(rows | spare))
     solver.free(rows | spare)
-    shots = tiled(find_shots(views, instant, masks), masks, solver, views)
+    shots = tiled(find_shots(views, instant.row, masks, instant.sent), masks, solver, views)
     losses, count = solver.settle(shots, options, usual=key.usual_loss)
     changed = solver.rows & ~(spare & (opacity(model.gaussians) <= options.density.min_opacity))
     figures = {
-        "instant": instant,
-        "seconds": time.monotonic() - started,
+        "instant": instant.row,
+        "seconds": time.monotonic() - instant.asked,
         "iterations": count,
         "dynamic": int(changed.sum()),
         "tiles": float(np.mean([shot.tiles.mean() for shot in shots if shot.tiles is not None])),

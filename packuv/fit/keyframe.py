@@ -39,7 +39,7 @@ from packuv.fit.start.first import AIR_OPACITY, first_gaussians, neighbour_dista
 from packuv.fit.start.hull import hull_points, in_hull
 from packuv.fit.start.points import Points, drawn, no_points, together
 from packuv.fit.start.shell import Shell, sweep_shell
-from packuv.footage import Silhouettes, Views, as_planes
+from packuv.footage import Silhouettes, Views
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, Quantizer, attribute_values
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, rows_of, with_canonical_axes
 from packuv.motion import Still
@@ -292,7 +292,7 @@ def still_shot(views: Views, stills: Sequence[Still], index: int) -> Shot:
     """What stands still in a camera, as a picture to explain."""
     still = stills[index]
     camera, response = views.cameras[still.camera], views.response(still.camera, None)
-    return Shot(camera, lambda: as_planes(stills[index].pixels), response, known=packed(still.known))
+    return Shot(camera, lambda: stills[index].pixels, response, known=packed(still.known))
 
 
 def undone(shot: Shot) -> np.ndarray:

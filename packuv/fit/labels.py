@@ -122,21 +122,21 @@ def count_hits(
     if device != "cpu":
         from packuv.fit.labels_cuda import count_on_gpu
 
-        return count_on_gpu(_opinion, gaussians.means, shapes, visible, list(voters), rule)
+        return count_on_gpu(_opinion, gaussians.means, shapes, visible, voters, rule)
     hits, views = np.zeros(len(gaussians), dtype=np.int32), np.zeros(len(gaussians), dtype=np.int32)
-    for view, table, depth in voters:
-        _vote(gaussians.means, shapes, visible, view, table, depth, rule, hits, views)
+    for view, mask, depth in voters:
+        _vote(gaussians.means, shapes, visible, view, summed_area(mask), depth, rule, hits, views)
     return hits, views
 
 
 def _voter(
     camera: PinholeCamera, mask: np.ndarray, depth: np.ndarray | None, near: float, low_pass_px2: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A camera's view, the summed areas of its mask, and its depths, float32 [H, W], or [0, 0] where it has none."""
-    view, table = view_constants(camera, near, low_pass_px2), summed_area(_check_picture(mask, camera, "mask"))
+    """A camera's view, its mask, and its depths, float32 [H, W], or [0, 0] where it has none."""
+    view, mask = view_constants(camera, near, low_pass_px2), _check_picture(mask, camera, "mask")
     if depth is None:
-        return view, table, np.zeros((0, 0), np.float32)
-    return view, table, np.ascontiguousarray(_check_picture(depth, camera, "depth"), np.float32)
+        return view, mask, np.zeros((0, 0), np.float32)
+    return view, mask, np.ascontiguousarray(_check_picture(depth, camera, "depth"), np.float32)
 
 
 def active_tiles(
@@ -157,7 +157,8 @@ def active_tiles(
         return np.ones((rows, columns), dtype=bool)
     _check_picture(mask, camera, "mask")
     padded = np.pad(mask, ((0, rows * TILE - camera.height), (0, columns * TILE - camera.width)))
-    tiles = np.asarray(padded.reshape(rows, TILE, columns, TILE).any(axis=(1, 3)))
+    by_row = padded.reshape(rows, TILE, columns * TILE).any(axis=1)  # at once over both axes takes seven times as long
+    tiles = np.asarray(by_row.reshape(rows, columns, TILE).any(axis=2))
     reach = np.sqrt(2 * np.log(np.maximum(opacity(moving) * (1 / ALPHA_MIN), 1)))  # in standard deviations, [N]
     _touch(moving.means, _shapes(moving), _visible(moving), reach, view_constants(camera, near, low_pass_px2), tiles)
     return tiles

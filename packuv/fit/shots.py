@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from packuv.fit.depth import SparseDepth
 from packuv.fit.labels import dynamic_labels
 from packuv.fit.options import ChangeOptions
 from packuv.fit.start.bounds import Bounds
-from packuv.footage import Response, Views
+from packuv.footage import Response, Views, as_planes
 from packuv.footage.response import PLAIN
 from packuv.gaussians.codes import Quantizer
 from packuv.gaussians.floats import Gaussians
@@ -24,6 +25,8 @@ VOID = 16 / 255
 
 Later = Callable[[], np.ndarray]
 """Reads an array when it is needed: of many cameras one at a time is whole in memory"""
+Sent = Callable[[], Any]
+"""Gives an array as it has come to a GPU"""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Shot:
 
     camera: PinholeCamera
     source: np.ndarray | Later
-    """float32 [3, H, W] in [0, 1], as filmed"""
+    """As filmed, uint8 [H, W, 3], or float32 [3, H, W] in [0, 1]"""
     response: Response = PLAIN
     """What the camera makes of the rig's colours"""
     tiles: np.ndarray | None = None
@@ -41,11 +44,19 @@ class Shot:
     """bool [H, W] where the picture counts within these tiles; None: everywhere"""
     depths: SparseDepth | None = None
     """Where the surface is known to be"""
+    sent: Sent | None = None
+    """The source, already on its way to the GPU; None: whoever needs it there sends it"""
+
+    @property
+    def filmed(self) -> np.ndarray:
+        """The picture as its source has it."""
+        return self.source() if callable(self.source) else self.source
 
     @property
     def target(self) -> np.ndarray:
         """float32 [3, H, W] in [0, 1], as filmed."""
-        return self.source() if callable(self.source) else self.source
+        filmed = self.filmed
+        return as_planes(filmed) if filmed.dtype == np.uint8 else filmed
 
     @property
     def certain(self) -> np.ndarray | None:
@@ -85,14 +96,20 @@ def halved(shot: Shot) -> Shot:
     return Shot(camera, target, response, known=None if shot.known is None else known)
 
 
-def find_shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | None = None) -> list[Shot]:
-    """Pictures of the cameras that have one, and whose mask, if given, is not empty."""
+def find_shots(
+    views: Views,
+    instant: int,
+    masks: Sequence[np.ndarray | None] | None = None,
+    sent: Sequence[Sent | None] | None = None,
+) -> list[Shot]:
+    """Pictures of the cameras that have one, and whose mask, if given, is not empty; some may be on their way."""
     shots = []
     for index, camera in enumerate(views.cameras):
         if masks is not None and (mask := masks[index]) is not None and not mask.any():
             continue
         if views.has(index, instant):
-            shots.append(Shot(camera, partial(_filmed, views, index, instant), views.response(index, instant)))
+            source, response = partial(_filmed, views, index, instant), views.response(index, instant)
+            shots.append(Shot(camera, source, response, sent=sent[index] if sent else None))
     if masks is None and len(shots) < 2:
         raise ValueError(f"instant {instant} has pictures of {len(shots)} cameras to fit, but needs two or more; "
                          "choose another range with --frames")  # fmt: skip
@@ -100,9 +117,9 @@ def find_shots(views: Views, instant: int, masks: Sequence[np.ndarray | None] | 
 
 
 def _filmed(views: Views, camera: int, instant: int) -> np.ndarray:
-    filmed = views.filmed(camera, instant)
-    assert filmed is not None, "who lacks the picture has no shot"
-    return filmed
+    pixels = views.pixels(camera, instant)
+    assert pixels is not None, "who lacks the picture has no shot"
+    return pixels
 
 
 def moving_rows(

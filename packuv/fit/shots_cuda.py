@@ -12,7 +12,7 @@ from torch import Tensor
 from packuv.fit.losses import pixel_count
 from packuv.fit.shots import VOID, Shot
 from packuv.footage.response import OFFSET, shading
-from packuv.raster.cuda.launch import MEMORY, on_device, run_rows, shared
+from packuv.raster.cuda.launch import MEMORY, on_device, run_rows, send, shared
 from packuv.raster.picture import checked_tiles
 
 cuda: Any = numba.cuda
@@ -21,11 +21,11 @@ _LEVELS = 255
 
 
 class ShotOnGpu:
-    """The arrays of a shot. Pictures of 8 bits take a byte per value."""
+    """The arrays of a shot. What was filmed takes a byte per value."""
 
     def __init__(self, shot: Shot) -> None:
         self.shot = shot
-        camera, target, known = shot.camera, shot.target, shot.certain
+        camera, known = shot.camera, shot.certain
         active = checked_tiles(shot.tiles, camera)
         self.active, self.tiles = on_device(active), on_device(np.flatnonzero(active))
         """uint8 [tiles_y, tiles_x], and the numbers of the active ones, int64"""
@@ -37,18 +37,22 @@ class ShotOnGpu:
         self.depths = None if depths is None else (on_device(depths.pixels), on_device(depths.depth))
         """Known depths: pixels, int64 [P], and depth, float32 [P]"""
         self._response = tuple(map(on_device, shot.response.arrays))
-        bytes_ = np.rint(np.nan_to_num(target).clip(0, 1) * _LEVELS).astype(np.uint8)
-        exact = np.array_equal(bytes_.astype(np.float32) / _f32(_LEVELS), target)
-        self._source = on_device(bytes_ if exact else target)
+        self._source: Tensor = (shot.sent or send(shot.filmed))()
         self._most = torch.tensor(float(_LEVELS), device=MEMORY)  # torch would multiply by a plain number's inverse
-        self.void_share = float(self.void(self.target).sum(dtype=torch.int64)) / (camera.height * camera.width)
-        """Share of the pixels that may show nothing"""
 
     @property
     def target(self) -> Tensor:
         """float32 [3, H, W] in [0, 1], as filmed."""
         source = self._source
-        return source.float() / self._most if source.dtype == torch.uint8 else source
+        if source.dtype != torch.uint8:
+            return source
+        planes = source.permute(2, 0, 1).to(torch.float32, memory_format=torch.contiguous_format)
+        return planes.div_(self._most)
+
+    @property
+    def void_share(self) -> float:
+        """Share of the pixels that may show nothing."""
+        return float(self.void(self.target).sum(dtype=torch.int64)) / (self.shot.camera.height * self.shot.camera.width)
 
     def void(self, target: Tensor) -> Tensor:
         """Where the picture may show nothing, bool [H, W]."""

@@ -317,6 +317,7 @@ class FitSegment(Stage):
             motion=MotionCache.load(work.path(self.motion) / MOTION),
             options=self.options,
             scratch=work.scratch,
+            workers=work.site.threads,
             progress=work.progress,
         )
         hold_absent(segment).save(work.out / SEGMENT)

@@ -6,6 +6,7 @@ CPU's memory, and everything else is the same.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from types import FunctionType
 from typing import Any
@@ -39,6 +40,32 @@ def run_rows(kernel: Any, count: int, *given: Any) -> None:
 def on_device(array: np.ndarray) -> Tensor:
     """A copy for kernels."""
     return torch.tensor(array, device=MEMORY)
+
+
+def send(array: np.ndarray) -> Callable[[], Tensor]:
+    """Begin to copy an array for kernels, beside what they do; the function that it returns gives the copy, and has
+    kernels from then on wait for it. Any thread may send."""
+    if MEMORY.type == "cpu":
+        there = on_device(array)
+        return lambda: there
+    here = torch.tensor(array).pin_memory()  # which torch leaves alone until it has been copied
+    with torch.cuda.stream(_aside()):
+        copy = here.to(MEMORY, non_blocking=True)
+        arrived = _aside().record_event()
+
+    def taken() -> Tensor:
+        kernels = torch.cuda.current_stream()
+        kernels.wait_event(arrived)
+        copy.record_stream(kernels)  # or else the next copy could take its memory while they read
+        return copy
+
+    return taken
+
+
+@cache
+def _aside() -> torch.cuda.Stream:
+    """Of copies."""
+    return torch.cuda.Stream()
 
 
 @cache

@@ -12,6 +12,8 @@ import torch
 
 from packuv.fit.density import DensityOptions
 from packuv.fit.device import compared_differently, drawn_differently, labelled_differently
+from packuv.fit.labels import summed_area
+from packuv.fit.labels_cuda import _summed_area
 from packuv.fit.losses import PhotometricOptions, photometric_loss
 from packuv.fit.model import Model
 from packuv.fit.options import FitOptions
@@ -30,6 +32,11 @@ pytestmark = needs("cuda", SIMULATED or torch.cuda.is_available(), "no CUDA devi
 
 def test_labels_are_the_cpus():
     assert labelled_differently("cuda") is None
+
+
+def test_sums_of_masks_are_the_cpus():
+    mask = np.random.default_rng(1).random((13, 9)) < 0.4
+    assert np.array_equal(_summed_area(mask).cpu().numpy(), summed_area(mask))
 
 
 def test_the_loss_of_a_made_up_picture_is_the_cpus():

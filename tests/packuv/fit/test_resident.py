@@ -12,23 +12,28 @@ import pytest
 import torch
 
 from packuv.camera import PinholeCamera
+from packuv.fit import frames as frames_module
 from packuv.fit import resident, terms, terms_cuda
 from packuv.fit.backdrop import Backdrop
 from packuv.fit.density import DensityOptions
 from packuv.fit.depth import SparseDepth
-from packuv.fit.keyframe import choose_quantizer
+from packuv.fit.frames import fit_segment
+from packuv.fit.keyframe import KeyState, choose_quantizer
+from packuv.fit.lift import LiftOptions
 from packuv.fit.model import Model
-from packuv.fit.options import FitOptions
+from packuv.fit.options import FitOptions, FrameOptions
 from packuv.fit.resident import ResidentSolver
 from packuv.fit.shots import Shot
 from packuv.fit.shots_cuda import ShotOnGpu
 from packuv.fit.solver import Solver
 from packuv.fit.solvers import open_solver
 from packuv.fit.start.bounds import Bounds
-from packuv.footage import Response
+from packuv.footage import LensCamera, Response, Views
 from packuv.gaussians.codes import Codes
 from packuv.gaussians.floats import ATTRIBUTES, Gaussians, arrays
+from packuv.gaussians.segment import Segment
 from packuv.raster import render
+from packuv.raster.cuda.launch import send
 from tests.support.dense_raster import OPTIONS, camera, scene
 from tests.support.needs import needs
 
@@ -229,14 +234,78 @@ def test_a_loss_that_is_not_finite_stops_the_fit():
         solver("cuda").run(broken, 1, of=10)
 
 
-def test_pictures_of_8_bits_take_a_byte_and_are_the_same_to_the_bit():
-    levels = np.arange(256, dtype=np.float32) / np.float32(255)
-    picture = np.resize(levels, (3, 16, 16))
-    held = ShotOnGpu(Shot(view("a"), picture))
-    assert held._source.dtype == torch.uint8
-    assert np.array_equal(held.target.cpu().numpy(), picture)
-    held = ShotOnGpu(Shot(view("a"), picture + np.float32(1e-6)))
-    assert np.array_equal(held.target.cpu().numpy(), picture + np.float32(1e-6))
+def test_what_was_filmed_takes_a_byte_a_value_and_is_the_same_to_the_bit():
+    pixels = np.random.default_rng(0).permutation(np.arange(768) % 256).astype(np.uint8).reshape(16, 16, 3)
+    pixels.setflags(write=False)  # as views give them
+    here = Shot(view("a"), lambda: pixels)
+    for shot in (here, replace(here, sent=send(pixels))):
+        held = ShotOnGpu(shot)
+        assert held._source.dtype == torch.uint8
+        assert held.target.is_contiguous()
+        assert np.array_equal(held.target.cpu().numpy(), here.target)
+        assert held.void_share == here.void.mean()
+    floats = here.target + np.float32(1e-6)
+    assert np.array_equal(ShotOnGpu(Shot(view("a"), floats)).target.cpu().numpy(), floats)
+
+
+def test_a_picture_that_has_been_sent_is_not_read_again():
+    def read() -> np.ndarray:
+        raise ValueError("it is damaged")
+
+    pixels = np.full((16, 16, 3), 7, np.uint8)
+    assert np.all(ShotOnGpu(Shot(view("a"), read, sent=send(pixels))).target.cpu().numpy() == np.float32(7) / 255)
+    with pytest.raises(ValueError, match=r"^it is damaged$"):
+        solver("cuda").run([Shot(view("a"), read)], 1, of=10)
+
+
+class Filmed:
+    """In place of a `FrameReader`, so that this needs no decoder."""
+
+    def __init__(self, pictures: dict[str, list[np.ndarray]]) -> None:
+        self.pictures = pictures
+
+    def read(self, name: str, frame: int) -> np.ndarray:
+        return self.pictures[name][frame]
+
+
+class Everywhere:
+    """In place of a `MotionCache`: all moves, but in camera "b" at the second instant nothing does."""
+
+    names = ("a", "b")
+
+    def mask(self, camera: int, instant: int) -> np.ndarray:
+        return np.full((16, 16), (camera, instant) != (1, 2))
+
+
+def test_a_segment_is_the_same_with_pictures_prepared_ahead(tmp_path, monkeypatch):
+    """To the byte, for every sum has a fixed order."""
+    still, rng = scene(10, degree=0), np.random.default_rng(3)
+    pictures = {name: list(rng.integers(0, 256, (3, 16, 16, 3), dtype=np.uint8)) for name in ("a", "b")}
+    lenses, frames = [LensCamera(view(name)) for name in pictures], np.arange(3).repeat(2).reshape(3, 2)
+    views = Views(dict.fromkeys(pictures, tmp_path), frames, lenses, reader=Filmed(pictures))
+    key = KeyState(0, still, 0, choose_quantizer(still, BOUNDS, 0), BOUNDS, {"loss": 1.0})
+    options = FitOptions(device="cuda", frame_iterations=1, spare=1, lift=LiftOptions(enabled=False))
+    sent = list[int]()
+
+    def counted(array: np.ndarray) -> Any:
+        sent.append(array.nbytes)
+        return send(array)
+
+    def fitted(name: str) -> Segment:
+        (tmp_path / name).mkdir()
+        given: Any = {"motion": Everywhere(), "options": options.part(FrameOptions), "scratch": tmp_path / name}
+        return fit_segment(key, views, range(3), **given)[0]
+
+    monkeypatch.setattr(frames_module, "_sender", lambda device: counted)
+    ahead = fitted("ahead")
+    assert sent == 3 * [16 * 16 * 3]
+    monkeypatch.setattr(frames_module, "_sender", lambda device: None)
+    plain = fitted("plain")
+    for name in ("xyz", "attributes"):
+        assert np.array_equal(getattr(ahead, name), getattr(plain, name))
+        assert np.array_equal(getattr(ahead.key, name), getattr(plain.key, name))
+    assert len(plain.xyz) == 2
+    assert not np.array_equal(plain.attributes[0], plain.attributes[1])
 
 
 def test_responses_are_the_cpus():
