@@ -369,7 +369,7 @@ def gpu_memory_of(size: Size, options: SequenceOptions, most: int) -> float:
     cap = fit.density.cap
     still = round(fit.backdrop_share * cap) if fit.background.instants else 0
     first = FitLoad(sides, still or cap, sh_degree=fit.sh_degree, depths=fit.shell.places)
-    then = FitLoad(sides, cap - still + fit.spare, still, fit.sh_degree)
+    then = FitLoad(sides, cap - still + fit.spare, still, fit.sh_degree, instants=2)
     return max(fit_memory(load, budget_bytes=most).all_bytes for load in (first, then))
 
 

@@ -23,7 +23,8 @@ HELD = 1.2
 """Of torch's memory over what is alive in it: blocks are cut to sizes that change from picture to picture. An
 assumption, for no GPU has been at hand"""
 BASE_BYTES = 1_000_000_000
-"""Of a process that draws anything at all: CUDA's context, torch's and numba's kernels and their stacks; likewise"""
+"""Of a process that draws anything at all: CUDA's context, torch's and numba's kernels and their stacks, and 24 MB for
+a UV map of 1024x1024 while rows come and go; likewise"""
 ROW_BYTES = 20 + 1 + 1 + 12 + 8 + 8
 """Of a Gaussian that may change, beside floats and codes: steps, whether it may, and has otherwise than by a step, code
 of its place, screen gradients"""
@@ -51,6 +52,8 @@ class FitLoad:
     """Pixels of a picture whose depth is known"""
     in_bytes: bool = True
     """Whether pictures are of 8 bits"""
+    instants: int = 1
+    """Whose pictures are there: of frames the next one's, too"""
     own_pairs: int | None = None
     """Of those that may change with the tiles of a picture; None: as `pairs_of`"""
     layer_pairs: int | None = None
@@ -81,7 +84,7 @@ def pairs_of(gaussians: int, width: int, height: int) -> int:
 
 
 def alive_bytes(load: FitLoad) -> int:
-    """Of all tensors at the worst moment, with the layer of one camera."""
+    """Of all tensors at the worst moment, with the layer of one camera. Labels, a camera at a time, take less."""
     rows, still, floats = load.gaussians, load.backdrop, 4 * _columns(load.sh_degree)
     width, height = _largest(load)
     pixels, tiles = width * height, _tiles(width, height)
@@ -89,19 +92,19 @@ def alive_bytes(load: FitLoad) -> int:
     both, drawn = own + layer, rows + still
     listed = 76 * rows + PAIR_BYTES * own
     joined = RECORD_BYTES * drawn + PAIR_BYTES * both if still else 0
-    working = WORKING_BYTES * pixels + listed + joined + 8 * both + 36 * tiles
+    compared = WORKING_BYTES * pixels + listed + joined + 8 * both + 36 * tiles
     iteration = max(
         TARGET_BYTES * pixels + max((floats + 97) * still + PAIR_BYTES * layer, 157 * still + 28 * layer),  # composed
         TARGET_BYTES * pixels + 101 * rows + PAIR_BYTES * own,  # listed
         TARGET_BYTES * pixels + listed + joined + 13 * layer,  # joined
         TARGET_BYTES * pixels + listed + joined + (16 + SORT_SCRATCH) * both + 16 * tiles,  # sorted
-        working + 52 * rows,  # compared
-        working + 41 * own + (floats + 25) * rows + 2 * still,  # carried back
+        compared + 52 * rows,
+        compared + 41 * own + (floats + 25) * rows + 2 * still,  # carried back
     )
     resident = rows * (5 * floats + ROW_BYTES + _columns(load.sh_degree) - 4) + _layer_bytes(still, layer)
     resident += TABLE_BYTES + 1024 * _columns(load.sh_degree) + _shots_bytes(load)
     whole = (floats + 101) * drawn + (20 + PAIR_BYTES + 16 + SORT_SCRATCH) * both + 20 * pixels + _shots_bytes(load)
-    return max(resident + iteration, whole, _labels_bytes(load) + _layer_bytes(still, layer))
+    return max(resident + max(iteration, _changed_bytes(load)), whole)
 
 
 def fit_memory(load: FitLoad, *, budget_bytes: int) -> GpuMemory:
@@ -176,11 +179,11 @@ def _layer_bytes(gaussians: int, layer_pairs: int) -> int:
 
 def _shots_bytes(load: FitLoad) -> int:
     """Of what is to be explained, with what of it is known, active tiles, and depths."""
-    picture = 4 if load.in_bytes else 13
+    picture = (3 if load.in_bytes else 12) * load.instants + 1
     return sum(picture * w * h + 9 * _tiles(w, h) + 12 * load.depths for w, h in load.sides)
 
 
-def _labels_bytes(load: FitLoad) -> int:
-    """Of the vote of all cameras at once on what moves: areas of their masks, and each Gaussian's shape."""
-    area = math.prod(max(side[axis] for side in load.sides) + 1 for axis in (0, 1))
-    return len(load.sides) * (4 * area + 300) + 117 * load.gaussians
+def _changed_bytes(load: FitLoad) -> int:
+    """Beside what is resident, while rows come and go: who has a place in the UV map, or the rows before and after."""
+    seats = 168 * (load.gaussians + load.backdrop)
+    return max(seats, load.gaussians * (8 * _columns(load.sh_degree) + 60))

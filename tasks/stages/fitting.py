@@ -307,7 +307,7 @@ class FitSegment(Stage):
 
     def gpu_memory(self, work: Work) -> GpuMemory:
         key = KeyState.load(work.path(self.key))
-        return _next_memory(work, self.take, key, len(key.foreground) + self.options.spare)
+        return _next_memory(work, self.take, key, len(key.foreground) + self.options.spare, instants=2)
 
     def build(self, work: Work) -> Notes:
         segment, figures = fit_segment(
@@ -409,9 +409,9 @@ def _first_memory(work: Work, take: Take, options: FirstOptions, gaussians: int)
     return fit_memory(load, budget_bytes=work.site.memory_bytes)
 
 
-def _next_memory(work: Work, take: Take, before: KeyState, gaussians: int) -> GpuMemory:
+def _next_memory(work: Work, take: Take, before: KeyState, gaussians: int, *, instants: int = 1) -> GpuMemory:
     """Of a fit that starts from a keyframe or the backdrop, of which so many may change."""
-    load = FitLoad(_sides(work, take), gaussians, before.backdrop, before.quantizer.sh_degree)
+    load = FitLoad(_sides(work, take), gaussians, before.backdrop, before.quantizer.sh_degree, instants=instants)
     return fit_memory(load, budget_bytes=work.site.memory_bytes)
 
 
