@@ -185,5 +185,5 @@ def _shots_bytes(load: FitLoad) -> int:
 
 def _changed_bytes(load: FitLoad) -> int:
     """Beside what is resident, while rows come and go: who has a place in the UV map, or the rows before and after."""
-    seats = 168 * (load.gaussians + load.backdrop)
-    return max(seats, load.gaussians * (8 * _columns(load.sh_degree) + 60))
+    seats = 184 * (load.gaussians + load.backdrop)
+    return max(seats, load.gaussians * (8 * _columns(load.sh_degree) + 72))
