@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from packuv.each import spread
 from packuv.gaussians.floats import SH_C0, Gaussians, arrays, drawn, logit
 from packuv.interchange import WRITTEN, SplatFormat, read_gaussians, write_gaussians
 from packuv.interchange.clip import Clip, ClipOptions
@@ -17,7 +18,7 @@ from packuv.interchange.conventions import half_turn
 from packuv.interchange.fourdgs import SH_REACH
 from packuv.metrics import decibels
 from packuv.scene import Scene
-from packuv.score import Artist, spread
+from packuv.score import Artist
 
 MEASURED = tuple(
     kind for kind in WRITTEN if kind == SplatFormat.FOURDGS or (kind.door.read is not None and kind.door.write)

@@ -1,4 +1,4 @@
-"""Large things by the hundred, of which one at a time is looked at: made each time that somebody asks."""
+"""Many things, of which few are looked at: one at a time, made each time that somebody asks, or some of them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Generic, TypeVar, overload
 import numpy as np
 
 Item = TypeVar("Item", covariant=True)
+One = TypeVar("One")
 
 
 class Each(Sequence[Item], Generic[Item]):
@@ -53,3 +54,14 @@ def as_bits(masks: Iterable[np.ndarray | None]) -> Each[np.ndarray | None]:
         return None if read is None else read()
 
     return Each(one, len(unpack))
+
+
+def spread(items: Sequence[One], count: int) -> tuple[One, ...]:
+    """`count` of the items at equal distances; all of them if there are fewer.
+
+    >>> spread(["a", "b", "c", "d", "e", "f"], 3)
+    ('b', 'd', 'f')
+    """
+    if count >= len(items):
+        return tuple(items)
+    return tuple(items[(2 * place + 1) * len(items) // (2 * count)] for place in range(count))

@@ -12,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, cast
 
 import cv2
 import numpy as np
@@ -93,7 +93,6 @@ PART = 256
 AHEAD = 2
 """Drawn pictures that may wait for each worker"""
 
-Item = TypeVar("Item")
 Measure = Callable[[np.ndarray, np.ndarray], float]
 """Of a picture and its truth, float32 [3, H, W], sRGB"""
 
@@ -546,14 +545,3 @@ def _means(scores: Sequence[Score], figures: Sequence[str]) -> dict[str, float |
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else None
-
-
-def spread(items: Sequence[Item], count: int) -> tuple[Item, ...]:
-    """`count` of the items at equal distances; all of them if there are fewer.
-
-    >>> spread(["a", "b", "c", "d", "e", "f"], 3)
-    ('b', 'd', 'f')
-    """
-    if count >= len(items):
-        return tuple(items)
-    return tuple(items[(2 * place + 1) * len(items) // (2 * count)] for place in range(count))

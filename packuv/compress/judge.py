@@ -12,10 +12,10 @@ from packuv.colour import lit
 from packuv.compress.filmed import Filmed
 from packuv.compress.imagined import IMAGINED, looked_at
 from packuv.compress.views import Views
+from packuv.each import spread
 from packuv.footage import Views as Footage
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene, open_scene
-from packuv.score import spread
 
 FRAMES, CAMERAS = 3, 12
 """Of which pictures tell distortion, at most, spread evenly: 36 of them differ from all by some tenths of a decibel"""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from packuv.bounds import MOST_NS, MOST_SIDE_PX, field, fields, whole
+from packuv.each import spread
 from packuv.files import save_json
 from packuv.footage import LensCamera, Light, Silhouettes, Transfer, Views, laid_over
 from packuv.footage.lens import unabridged
@@ -23,7 +24,7 @@ from packuv.motion.foreground import compare_masks
 from packuv.progress import Progress
 from packuv.scene import SceneHeader, open_scene
 from packuv.scene.header import LENSES
-from packuv.score import Likeness, Score, glance, score, segment_starts, spread, summary, write_pictures, write_table
+from packuv.score import Likeness, Score, glance, score, segment_starts, summary, write_pictures, write_table
 from sync.align import AlignOptions, FrameGroups, align
 from sync.capture import find_capture, load_timecodes, probe_capture
 from sync.clock import ClockMode

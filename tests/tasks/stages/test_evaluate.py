@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from packuv.colour import linear_from_srgb, srgb_from_linear
+from packuv.each import spread
 from packuv.metrics import psnr
-from packuv.score import Score, read_table, spread, summary, with_own_gain, write_table
+from packuv.score import Score, read_table, summary, with_own_gain, write_table
 from sync.align import FrameGroups
 from tasks.artefacts.stage import Files
 from tasks.artefacts.store import Key

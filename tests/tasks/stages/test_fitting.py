@@ -72,7 +72,7 @@ def test_fits_foresee_what_they_read(work: Work, take: Take, state: Key) -> None
         FitFirst(take=take, instant=0, options=part(FirstOptions)): FitLoad([], 1000, 0, 1, **first),
         FitNext(**following, background=None, end=None, instant=1, motion=MotionOptions()): FitLoad([], 200, 800, 1),
         FitSegment(take=take, motion=state, key=state, span=(0, 2), options=part(FrameOptions), number=1):
-            FitLoad([], 90 + 50, 800, 1),
+            FitLoad([], 90 + 50, 800, 1, instants=2),
         PatchBackdrop(**following, before=state, after=state, epoch=1): FitLoad([], 1000, 800, 1),
     }  # fmt: skip
     for stage, load in asked.items():
