@@ -6,6 +6,7 @@ sum has a fixed order.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numba.cuda
@@ -46,10 +47,14 @@ def compare(
     blocks, pictures = len(picture) * len(tiles), (picture, target, active, tiles)
     derivatives = torch.zeros((3, *picture.shape), device=MEMORY)
     gradient, sums = torch.zeros(picture.shape, device=MEMORY), torch.zeros((blocks, 2), device=MEMORY)
-    window = on_device(WINDOW)
-    run(_compare, blocks, *pictures, window, derivatives, sums)
-    run(_slopes, blocks, *pictures, window, derivatives, _f32(l1_scale), _f32(ssim_scale), gradient)
+    run(_compare, blocks, *pictures, _window(), derivatives, sums)
+    run(_slopes, blocks, *pictures, _window(), derivatives, _f32(l1_scale), _f32(ssim_scale), gradient)
     return sums.double().sum(0), gradient
+
+
+@cache
+def _window() -> Tensor:
+    return on_device(WINDOW)
 
 
 @cuda.jit(device=True)

@@ -62,6 +62,7 @@ class RowsOnGpu:
         """What the renderer draws"""
         if quantizer is not None:
             self._draw_codes(quantizer, quantizer.encode(model.gaussians))
+        self._lay_out()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -72,11 +73,16 @@ class RowsOnGpu:
         centre, unit, *ranges = quantizer.scale
         tables = quantizer.xyz_table, quantizer.attribute_table
         self._scale = on_device(centre), float(unit), *map(on_device, ranges), *map(on_device, tables)
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        """Keep what kernels get each time as [N, columns]: masters, good ones, and what is drawn."""
+        self._lines = tuple(_flat(part) for part in (self.masters, self._good, self.drawn))
 
     def step(self, gradients: Sequence[Tensor], rates: Tensor, moving: Tensor, number: int) -> None:
         """One step of Adam for the `moving` rows, uint8 [N]; those that break go back to their last good state, the
         others are encoded and decoded again. `rates` as `rates_of`; `number` tells the iteration."""
-        values, slopes, good = (_flat(part) for part in (self.masters, gradients, self._good))
+        slopes, (values, good, _) = _flat(gradients), self._lines
         memory = self._first, self._second, self._steps
         given = rates, moving, self._corrections, *factors(self._adam)
         run_rows(_advance, len(self), *values, *slopes, *memory, *given)
@@ -88,8 +94,8 @@ class RowsOnGpu:
         """Encode these rows, uint8 [N], and draw what the codes decode to; with no quantizer masters are drawn."""
         if self._quantizer is None:
             return
-        masters, drawn = _flat(self.masters), _flat(self.drawn)
-        masters[3], drawn[3] = self.masters[3], self.drawn[3]
+        masters, drawn = ([*lines[:3], own[3], lines[4]] for lines, own in
+                          ((self._lines[0], self.masters), (self._lines[2], self.drawn)))  # fmt: skip
         run_rows(_code, len(self), *masters, rows, *self._scale, self._xyz, self._attributes, *drawn)
 
     def column(self, name: str) -> np.ndarray:
@@ -127,6 +133,7 @@ class RowsOnGpu:
     def renew(self) -> None:
         """Take the rows as they stand for good, and draw what the changed ones' codes decode to."""
         self._good = tuple(values.clone() for values in self.masters)
+        self._lay_out()
         self._draw_again(self._fresh)
         self._fresh.zero_()
 

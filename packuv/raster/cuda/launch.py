@@ -20,9 +20,12 @@ from torch import Tensor
 cuda: Any = numba.cuda
 config: Any = numba.config
 SIMULATED = bool(config.ENABLE_CUDASIM)
+_SEEN = "_seen_by_kernels"
 MEMORY = torch.device("cpu" if SIMULATED else "cuda")
 THREADS = 256
 """Of a block, in loops over Gaussians"""
+SMALL_BYTES = 1 << 20
+"""Of an array that goes up by way of memory which a GPU reads by itself"""
 
 
 def run(kernel: Any, blocks: int, *given: Any) -> None:
@@ -38,8 +41,12 @@ def run_rows(kernel: Any, count: int, *given: Any) -> None:
 
 
 def on_device(array: np.ndarray) -> Tensor:
-    """A copy for kernels."""
-    return torch.tensor(array, device=MEMORY)
+    """A copy for kernels. For a small one the host does not wait until they have done what it asked for so far."""
+    here = torch.tensor(array)
+    if MEMORY.type == "cpu":
+        return here
+    small = here.nbytes <= SMALL_BYTES
+    return (here.pin_memory() if small else here).to(MEMORY, non_blocking=small)
 
 
 def send(array: np.ndarray) -> Callable[[], Tensor]:
@@ -75,9 +82,16 @@ def _allow_small_grids() -> None:
 
 
 def _as_kernels_see(value: Any) -> Any:
+    """A tensor as numba's array, which stays with the tensor: to make one takes the host as long as a small kernel. It
+    does not hold the tensor, or none would ever be freed."""
     if not isinstance(value, Tensor):
         return value
-    return value.numpy() if SIMULATED else cuda.as_cuda_array(value)
+    if SIMULATED:
+        return value.numpy()
+    seen = value.__dict__.get(_SEEN)
+    if seen is None:
+        seen = value.__dict__[_SEEN] = cuda.from_cuda_array_interface(value.__cuda_array_interface__, sync=False)
+    return seen
 
 
 def shared(function: Any) -> Any:
