@@ -22,8 +22,8 @@ from packuv.fit import losses_cuda
 from packuv.raster.cuda import launch, render
 from packuv.raster.cuda.project import count_tiles, list_tiles
 
-Launch = tuple[str, int]
-"""Name of a kernel, and how many tensors it is given"""
+Launch = tuple[str, int, int]
+"""Name of a kernel, how many tensors it is given, and how many of these no kernel was given before"""
 
 
 @contextmanager
@@ -37,7 +37,11 @@ def idle(hits: Callable[[int], np.ndarray]) -> Iterator[list[Launch]]:
         elif kernel is list_tiles:
             given[-3].numpy()[:] = 0  # keys: memory as it was found has no tiles
         if blocks > 0:
-            launches.append((kernel.fn.__name__, sum(isinstance(value, Tensor) for value in given)))
+            tensors = [value for value in given if isinstance(value, Tensor)]
+            new = sum("known" not in vars(tensor) for tensor in tensors)
+            launches.append((kernel.fn.__name__, len(tensors), new))
+            for tensor in tensors:
+                vars(tensor)["known"] = True
 
     with ExitStack() as stack:
         for place in (launch, render, losses_cuda):
