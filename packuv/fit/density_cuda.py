@@ -49,7 +49,7 @@ def views_showing(rendering: OnGpu, means: Tensor, camera: PinholeCamera, option
     surface = torch.sort(depth[drawn] / alpha[drawn]).values
     usual = float(surface[[(len(surface) - 1) // 2, len(surface) // 2]].mean()) if len(surface) else 0.0
     axis = camera.camera_from_world[2]
-    z = means.double() @ on_device(axis[:3]) + axis[3]
+    z = (means.double() * on_device(axis[:3])).sum(dim=1) + axis[3]
     return shown * torch.where(z >= options.afar * usual, options.least_views, 1)
 
 

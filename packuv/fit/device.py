@@ -22,6 +22,8 @@ PICTURE_TOLERANCE = 2e-4
 sums, and its exponential is another; by how much that differs has not been measured"""
 GRADIENT_TOLERANCE = 1e-3
 """Norm of the difference by the norm, per attribute; 1e-6 in the simulator"""
+OUT_OF_MEMORY = ("CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory")
+"""The driver's words by way of numba, and torch's for what it asks the driver for itself, such as a context"""
 _NEAR = 0.05
 
 
@@ -56,7 +58,8 @@ def obstacle() -> str | None:
 
 def gpu_is_full(error: BaseException) -> bool:
     """Whether an error says that the GPU's memory is used up: torch's, or the driver's by way of numba."""
-    return type(error).__name__ == "OutOfMemoryError" or "CUDA_ERROR_OUT_OF_MEMORY" in str(error)
+    said = str(error)
+    return type(error).__name__ == "OutOfMemoryError" or any(words in said for words in OUT_OF_MEMORY)
 
 
 def drawn_differently(device: str) -> str | None:

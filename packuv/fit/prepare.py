@@ -95,5 +95,13 @@ def _prepare(views: Views, motion: MotionCache, index: int, row: int, *, flows: 
     if send is not None and (mask is None or mask.any()):
         with suppress(Exception):  # see `prepared`
             pixels = views.pixels(index, row, remember=False)
-            sent = None if pixels is None else send(pixels)
+            sent = None if pixels is None else _sent(send, pixels)
     return Prepared(None if mask is None else packed(mask), flow, sent)
+
+
+def _sent(send: Send, pixels: np.ndarray) -> Sent:
+    """Begin to send a picture, or else have it sent by whoever needs it; to read it again would be to seek."""
+    try:
+        return send(pixels)
+    except Exception:
+        return lambda: send(pixels)()

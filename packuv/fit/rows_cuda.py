@@ -62,7 +62,8 @@ class RowsOnGpu:
         """What the renderer draws"""
         if quantizer is not None:
             self._draw_codes(quantizer, quantizer.encode(model.gaussians))
-        self._lay_out()
+        else:
+            self._lay_out()
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -71,6 +71,8 @@ def _gpu() -> tuple[bool, str]:
         return False, "no NVIDIA driver; the CPU does everything"
     command = [query, "--query-gpu=name,memory.total,memory.free", "--format=csv,noheader,nounits"]
     answer = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    if answer.returncode:
+        return False, (answer.stdout.strip().splitlines() or ["a driver, but no GPU"])[0]
     found = "; ".join(_gpu_text(*line.rsplit(", ", 2)) for line in answer.stdout.splitlines())
     return bool(found), found or "a driver, but no GPU"
 

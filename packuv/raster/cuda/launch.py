@@ -56,14 +56,16 @@ def send(array: np.ndarray) -> Callable[[], Tensor]:
         there = on_device(array)
         return lambda: there
     here = torch.tensor(array).pin_memory()  # which torch leaves alone until it has been copied
-    with torch.cuda.stream(_aside()):
-        copy = here.to(MEMORY, non_blocking=True)
-        arrived = _aside().record_event()
+    copy = torch.empty(here.shape, dtype=here.dtype, device=MEMORY)  # of the kernels' memory, see `gpu_memory.reserve`
+    aside = _aside()
+    aside.wait_stream(torch.cuda.current_stream())  # which may still use what that memory was before
+    with torch.cuda.stream(aside):
+        copy.copy_(here, non_blocking=True)
+        arrived = aside.record_event()
+    copy.record_stream(aside)
 
     def taken() -> Tensor:
-        kernels = torch.cuda.current_stream()
-        kernels.wait_event(arrived)
-        copy.record_stream(kernels)  # or else the next copy could take its memory while they read
+        torch.cuda.current_stream().wait_event(arrived)
         return copy
 
     return taken
@@ -71,7 +73,7 @@ def send(array: np.ndarray) -> Callable[[], Tensor]:
 
 @cache
 def _aside() -> torch.cuda.Stream:
-    """Of copies."""
+    """Of copies. Threads that ask for it first at the same time may get one each."""
     return torch.cuda.Stream()
 
 

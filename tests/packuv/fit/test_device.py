@@ -89,6 +89,7 @@ def test_a_backdrop_has_layers():
 
 def test_used_up_memory_is_told_from_other_errors():
     assert gpu_is_full(torch.OutOfMemoryError("CUDA out of memory."))
+    assert gpu_is_full(RuntimeError("CUDA error: out of memory\nSearch for `cudaErrorMemoryAllocation'"))
     assert gpu_is_full(RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY"))
     assert not gpu_is_full(RuntimeError("[700] Call to cuCtxSynchronize results in CUDA_ERROR_ILLEGAL_ADDRESS"))
     assert not gpu_is_full(MemoryError())

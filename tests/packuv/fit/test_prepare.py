@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -167,6 +168,27 @@ def test_a_picture_that_cannot_be_read_says_so_where_it_is_needed(videos, ring, 
         shots[0].filmed  # noqa: B018  # it reads
 
 
+def test_a_picture_that_cannot_be_sent_is_sent_by_who_needs_it_and_not_read_again(videos, ring, motion):
+    reader, gpu = Watched(videos), Gpu()
+    views = open_views(videos, ring, reader)
+
+    def full(array: np.ndarray) -> Sent:
+        if threading.current_thread().name.startswith("packuv-prepare"):
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return gpu.send(array)
+
+    with prepared(views, motion, range(1, 2), flows=False, send=full, workers=2) as coming:
+        (instant,) = coming
+    read = sum(map(len, reader.read_frames.values()))
+    wanted = needed(motion, views, 1)
+    for k in wanted:
+        sent = instant.sent[k]
+        assert sent is not None
+        assert np.array_equal(sent(), open_views(videos, ring).pixels(k, 1))
+    assert sum(map(len, reader.read_frames.values())) == read
+    assert gpu.count == len(wanted)
+
+
 def test_a_mask_that_cannot_be_read_ends_it_with_its_own_sentence(videos, ring, motion, monkeypatch):
     def broken(self, camera, instant):
         if instant == 3:
@@ -223,6 +245,9 @@ def test_a_picture_travels_beside_the_kernels_which_wait_for_it(monkeypatch):
             asked.append(f"an event of {self.name}")
             return f"event of {self.name}"
 
+        def wait_stream(self, other: Any) -> None:
+            asked.append(f"{self.name} wait for {other.name}")
+
         def wait_event(self, event: str) -> None:
             asked.append(f"{self.name} waits for {event}")
 
@@ -232,9 +257,13 @@ def test_a_picture_travels_beside_the_kernels_which_wait_for_it(monkeypatch):
         yield
         asked.append(f"from {stream.name}")
 
-    def to(tensor, device, *, non_blocking: bool):
-        asked.append(f"copy to {device}, {'without' if non_blocking else 'with'} waiting")
-        return tensor.clone()
+    def empty(shape, *, dtype, device):
+        asked.append(f"memory of {device}")
+        return torch.zeros(tuple(shape), dtype=dtype)
+
+    def copy(tensor, source, *, non_blocking: bool):
+        asked.append(f"copy {'without' if non_blocking else 'with'} waiting")
+        tensor[:] = source
 
     kernels, aside = Stream("kernels"), Stream("copies")
     monkeypatch.setattr(launch, "MEMORY", torch.device("cuda"))
@@ -242,11 +271,13 @@ def test_a_picture_travels_beside_the_kernels_which_wait_for_it(monkeypatch):
     monkeypatch.setattr(torch.cuda, "stream", on)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda: kernels)
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda tensor: asked.append("pin") or tensor)
-    monkeypatch.setattr(torch.Tensor, "to", to)
+    monkeypatch.setattr(torch, "empty", empty)
+    monkeypatch.setattr(torch.Tensor, "copy_", copy)
     monkeypatch.setattr(torch.Tensor, "record_stream", lambda tensor, stream: asked.append(f"kept for {stream.name}"))
     pixels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
     taken = launch.send(pixels)
-    travel = ["pin", "to copies", "copy to cuda, without waiting", "an event of copies", "from copies"]
+    travel = ["pin", "memory of cuda", "copies wait for kernels", "to copies", "copy without waiting"]
+    travel += ["an event of copies", "from copies", "kept for copies"]
     assert asked == travel
     assert np.array_equal(taken().numpy(), pixels)
-    assert asked[len(travel) :] == ["kernels waits for event of copies", "kept for kernels"]
+    assert asked[len(travel) :] == ["kernels waits for event of copies"]

@@ -29,6 +29,18 @@ def test_a_gpu_is_named_with_its_memory(tmp_path, monkeypatch, lines, told):
     assert doctor._gpu() == (bool(lines), told)
 
 
+@pytest.mark.parametrize(
+    ("said", "told"), [("No devices were found", "No devices were found"), ("", "a driver, but no GPU")]
+)
+def test_a_driver_that_finds_no_gpu_is_believed(tmp_path, monkeypatch, said, told):
+    """It says so where the figures would be."""
+    program = tmp_path / "nvidia-smi"
+    program.write_text(f'#!/bin/sh\necho "{said}"\nexit 6\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert doctor._gpu() == (False, told)
+
+
 def test_without_a_driver_the_cpu_does_everything(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert doctor._gpu() == (False, "no NVIDIA driver; the CPU does everything")
