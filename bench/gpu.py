@@ -251,11 +251,9 @@ def send_all(pixels: np.ndarray, count: int) -> None:
 
 def _seconds(work: Callable[[], Any]) -> float:
     """Until the GPU has done it, too."""
-    rest()
-    begun = time.perf_counter()
-    work()
-    rest()
-    return time.perf_counter() - begun
+    taken: list[float] = []
+    _timed(work, taken)()
+    return taken[0]
 
 
 # A sequence
