@@ -93,7 +93,7 @@ class LookAhead:
             found = self._source.read(address.track, address.packet, address.frame)
         except ValueError as error:
             failed: Future[np.ndarray] = Future()
-            failed.set_exception(DamageError(f"{error} ({address.name})", address, None))
+            failed.set_exception(DamageError(f"{error} ({address.name}))", address, None))
             self._queue.append((address, failed))
         else:
             self._queue.append((address, self._pool.submit(self._decode, address, found)))
