@@ -53,6 +53,7 @@ class Link:
         self._posts: dict[object, Post] = {}
         self._guard = threading.Lock()
         self._finished, self._closed, self._wake = threading.Event(), threading.Event(), threading.Event()
+        self._flushed = threading.Event()
         self._thread: threading.Thread | None = None
         self._heard = time.monotonic()
 
@@ -68,9 +69,11 @@ class Link:
             self._posts[object() if instead_of is None else instead_of] = post
 
     def finish(self) -> None:
-        """The work is over, in whichever way: send what is left."""
+        """The work is over, in whichever way: send what is left before the engine says so, if that is soon."""
         self._finished.set()
         self._wake.set()
+        if self._thread:
+            self._flushed.wait(FLUSH_SECONDS)
 
     def close(self) -> None:
         """Stop listening."""
@@ -81,6 +84,12 @@ class Link:
             self._thread.join(FLUSH_SECONDS)
 
     def _listen(self, flow_run: UUID, jobs: Cancellable) -> None:
+        try:
+            self._serve(flow_run, jobs)
+        finally:
+            self._flushed.set()
+
+    def _serve(self, flow_run: UUID, jobs: Cancellable) -> None:
         with (
             temporary_settings({PREFECT_CLIENT_MAX_RETRIES: 0, PREFECT_API_REQUEST_TIMEOUT: REQUEST_SECONDS}),
             get_client(sync_client=True) as client,
@@ -88,8 +97,10 @@ class Link:
             while not self._closed.is_set():
                 self._wake.wait(LISTEN_SECONDS)
                 self._wake.clear()
+                finished = self._finished.is_set()
                 if self._taken(client, lambda client: _hear(client, flow_run, jobs)):
-                    self._send(client)
+                    if self._send(client) & finished:
+                        self._flushed.set()
                 elif not self._closed.is_set() and self._has_gone():
                     self._leave(str(client.api_url), jobs)
                     return

@@ -127,9 +127,12 @@ def test_json_starts_a_run_that_bears_its_name_and_leaves_its_tables(served):
     name = json.loads((next(out.glob("*/run.json"))).read_text())["sequence"]
     assert found["name"] == f"{name} draft"
     assert {"packuv", f"seq:{name}", "preset:draft"} <= set(found["tags"])
-    artefacts = {item["key"]: item for item in api("/artifacts/filter", {})}
-    assert {f"{name}-sync", f"{name}-summary"} <= set(artefacts)
-    assert "/results/" in artefacts[f"{name}-summary"]["data"]
+
+    def shown() -> dict[str, str]:
+        return {item["key"]: item["data"] for item in api("/artifacts/filter", {})}
+
+    wait_for(lambda: {f"{name}-sync", f"{name}-summary"} <= set(shown()), seconds=30)  # a busy server takes them later
+    assert "/results/" in shown()[f"{name}-summary"]
     with urllib.request.urlopen(f"{api.url.removesuffix('/api')}/results/{name}/report.html") as page:
         assert b"Synchronization" in page.read()
 

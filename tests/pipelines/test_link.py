@@ -40,6 +40,7 @@ class Server:
 def post(monkeypatch) -> Callable[[Server], None]:
     """Three posts, two of them of one name, through a link that opens and closes at once."""
     monkeypatch.setattr(pipelines.link, "LISTEN_SECONDS", 0.02)
+    monkeypatch.setattr(pipelines.link, "FLUSH_SECONDS", 2.0)
 
     def send(server: Server) -> None:
         monkeypatch.setattr(pipelines.link, "get_client", lambda **_: contextlib.nullcontext(server))
@@ -49,7 +50,9 @@ def post(monkeypatch) -> Callable[[Server], None]:
         link.post(lambda client: client.take("summary"))
         link.start(uuid4(), SimpleNamespace(cancel=pytest.fail))
         link.finish()
+        at_the_end = list(server.taken)
         link.close()
+        assert server.taken == at_the_end
 
     return send
 
