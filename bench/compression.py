@@ -55,7 +55,7 @@ class _Table:
     """Files of one scene, measured one after the other."""
 
     def __init__(self, scene: Scene, folder: Path) -> None:
-        self._scene, self._folder, self._judge = scene, folder, Judge(scene)
+        self._scene, self._folder, self._judge = scene, folder, Judge(scene).look(scene)
         self.segments = [scene.segment(number) for number in range(len(scene.index.segments))]
         self.codes = sum(len(part.key) * len(part) for part in self.segments)
         self.sensitivity = sensitivity(scene, self._judge.learned, self._judge.frames, near=self._judge.near)

@@ -76,7 +76,7 @@ class _Bench:
     """One scene, of one segment."""
 
     def __init__(self, scene: Scene, folder: Path, *, iterations: int, seed: int) -> None:
-        self._scene, self._folder, self._judge = scene, folder, Judge(scene)
+        self._scene, self._folder, self._judge = scene, folder, Judge(scene).look(scene)
         self._iterations, self._seed = iterations, seed
         self._segment = scene.segment(0)
         self._squares = row_sensitivity(

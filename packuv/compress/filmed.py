@@ -8,6 +8,7 @@ import numpy as np
 
 from packuv.footage import Views as Footage
 from packuv.metrics import psnr
+from packuv.progress import Ticks
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene
 
@@ -29,10 +30,12 @@ class Filmed:
         judged: Collection[str],
         frames: Sequence[int],
         near: float,
+        ticks: Ticks,
     ) -> None:
         """Instant i of `footage` is frame i of the lossless scene. Of the cameras that are `judged` some may be
-        `fitted`, by which others are followed, too. Raises ValueError where there is no picture to judge by."""
-        self.footage, self._frames = footage, frames
+        `fitted`, by which others are followed, too. Ticks count pictures. Raises ValueError where there is none to
+        judge by."""
+        self.footage, self._frames, self._ticks = footage, frames, ticks
         self._options, self._arena = RasterOptions(near=near), Arena()
         self.unfollowed = self._unlike(scene, fitted)
         """Fitted cameras whose pictures do not show what the scene does, and why that is thought of them"""
@@ -86,3 +89,4 @@ class Filmed:
                     drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
                     shown = self.footage.response(number, frame).shown(drawn)
                     yield camera.name, min(psnr(shown, filmed), EXACT_DB)
+                    self._ticks.advance()

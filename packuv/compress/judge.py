@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from packuv.compress.imagined import IMAGINED, looked_at
 from packuv.compress.views import Views
 from packuv.each import spread
 from packuv.footage import Views as Footage
+from packuv.progress import Ticks, no_progress
 from packuv.raster import Arena, RasterOptions, render
 from packuv.scene import Scene, open_scene
 
@@ -34,10 +36,9 @@ class Errors:
 
 
 class Judge:
-    """Pictures of a scene, to which those of others are compared."""
+    """Pictures of a scene, to which those of others are compared: which ones is settled at once, `look` draws them."""
 
-    def __init__(self, scene: Scene, footage: Footage | None = None) -> None:
-        """Raises ValueError for footage that has no picture to judge by."""
+    def __init__(self, scene: Scene) -> None:
         header = looked_at(scene)
         held_out = [camera for camera in header.cameras if camera.name in header.held_out]
         fitted = [camera for camera in header.cameras if camera.name not in header.held_out]
@@ -52,12 +53,33 @@ class Judge:
         self.near = header.near
         self.imagined = header.extra.get(IMAGINED)
         """What imagined cameras circle, JSON; None where the cameras are the scene's own"""
+        self._fitted = [camera.name for camera in fitted]
         self._options, self._arena = RasterOptions(near=self.near), Arena()
-        self._truth = {(frame, name): picture for frame, name, picture in self._pictures(scene)}
+        self._truth = dict[tuple[int, str], np.ndarray]()
+        self._ticks = Ticks(no_progress, 0)
         self.filmed: Filmed | None = None
+
+    def pictures(self, footage: Footage | None) -> tuple[int, int]:
+        """How many are drawn at the start, and by each trial; at most, where not all was filmed."""
+        trial = len(self.cameras) * len(self.frames)
+        if footage is None:
+            return trial, trial
+        return 2 * trial + len(self._fitted) * len(self.frames), 2 * trial
+
+    def look(self, scene: Scene, footage: Footage | None = None, ticks: Ticks | None = None) -> Self:
+        """Draw the scene, whose pictures are the true ones. Ticks of this and of later trials count pictures.
+
+        Raises ValueError for footage that has no picture to judge by.
+        """
+        self._ticks = ticks or self._ticks
+        self._truth = {(frame, name): picture for frame, name, picture in self._pictures(scene)}
         if footage is not None:
-            names, judged = [camera.name for camera in fitted], {camera.name for camera in self.cameras}
-            self.filmed = Filmed(scene, footage, fitted=names, judged=judged, frames=self.frames, near=self.near)
+            judged = {camera.name for camera in self.cameras}
+            self.filmed = Filmed(
+                scene, footage, fitted=self._fitted, judged=judged, frames=self.frames, near=self.near,
+                ticks=self._ticks,
+            )  # fmt: skip
+        return self
 
     def errors(self, path: Path) -> Errors:
         """Of a scene file."""
@@ -84,3 +106,4 @@ class Judge:
             for camera in self.cameras:
                 drawn = render(gaussians, camera, options=self._options, arena=self._arena).colour
                 yield frame, camera.name, np.clip(lit(drawn, scene.light(frame)), 0, 1).astype(np.float32)
+                self._ticks.advance()

@@ -161,16 +161,17 @@ class _Work:
         progress: Progress,
     ) -> None:
         self._scene, self._goal, self._folder, self._threads = scene, goal, folder, threads
-        self._judge = Judge(scene, footage)
+        self._judge = Judge(scene)
         learned, segments = self._judge.learned, scene.index.segments
         iterations = usual_iterations(len(segments)) if iterations is None else iterations
         self._passes = [iterations] + [-(-iterations // AGAIN)] * CORRECTIONS if iterations else []
-        self._pictures = len(self._judge.cameras) * len(self._judge.frames)
-        first = len(learned) * len(self._judge.frames)
+        first, trial = self._judge.pictures(footage)
+        first += len(learned) * len(self._judge.frames)
         first += sum(pictures_of(entry.frames, len(self._judge.views)) for entry in segments)
-        trials = self._pictures * (TRIALS + len(self._passes))
+        trials = trial * (TRIALS + len(self._passes))
         tuned = DRAWN * len(segments) * sum(self._passes)
         self._ticks = Ticks(progress, first + trials + tuned + 1)
+        self._judge.look(scene, footage, self._ticks)
         near, ticks = self._judge.near, self._ticks
         self._sensitivity = sensitivity(scene, learned, self._judge.frames, near=near, seed=seed, ticks=ticks)
         if not self._sensitivity.any():
@@ -266,7 +267,6 @@ class _Work:
         rows = self._rows.kept / self._rows.count
         size = self._encode(path, segments, steps, rows, LONGEST)
         errors = self._judge.errors(path)
-        self._ticks.advance(self._pictures)
         psnr_db = min(decibels(errors.mean), EXACT_DB)
         unseen_db = None if errors.unseen is None else min(decibels(errors.unseen), EXACT_DB)
         loss_db = self._goal.loss(psnr_db if unseen_db is None else unseen_db)

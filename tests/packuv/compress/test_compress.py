@@ -28,7 +28,7 @@ def lossless(tmp_path_factory):
 @pytest.fixture(scope="module")
 def learned(lossless):
     with open_scene(lossless) as scene:
-        judge = Judge(scene)
+        judge = Judge(scene).look(scene)
         yield judge, sensitivity(scene, judge.learned, judge.frames, near=judge.near)
 
 
@@ -149,7 +149,7 @@ def test_a_goal_is_kept_and_nearly_reached(lossless, tmp_path, goal):
         assert said["source_bytes"] == len(before)
         assert abs(said["psnr_db"] - found.psnr_db) < 1e-3
         with open_scene(lossless) as source:
-            judge = Judge(source)
+            judge = Judge(source).look(source)
     assert decibels(judge.errors(tmp_path / "small.mkv").mean) == pytest.approx(found.psnr_db, abs=1e-9)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["small.mkv"]
 

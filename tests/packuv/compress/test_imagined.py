@@ -48,13 +48,13 @@ def still_scene(path, rows=500, *, degree=0, opacity=None, **told):
 def test_own_cameras_are_kept(tmp_path):
     with open_scene(small_scene(tmp_path / "scene.mkv")) as scene:
         assert looked_at(scene) is scene.header
-        assert Judge(scene).imagined is None
+        assert Judge(scene).look(scene).imagined is None
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)], ids=str)
 def test_imagined_cameras_stand_in_rings_about_what_is_drawn(tmp_path, up):
     with open_scene(still_scene(tmp_path / "scene.mkv", extra={"up": up, "near": 0.25})) as scene:
-        header, judge, shown = looked_at(scene), Judge(scene), drawn(scene.gaussians(0))
+        header, judge, shown = looked_at(scene), Judge(scene).look(scene), drawn(scene.gaussians(0))
     centre, radius = middle(shown, share=CLOSE.share)
     near_middle = np.linalg.norm(shown.means - centre, axis=1) <= middle(shown, share=WHOLE.share)[1]
     assert near_middle.mean() > 0.9
@@ -100,7 +100,7 @@ def test_a_still_scene_that_nobody_filmed_is_compressed_and_says_so(tmp_path, de
     assert found.bytes < scene.stat().st_size
     assert verify_scene(tmp_path / "small.mkv").ok
     with open_scene(scene) as source, open_scene(tmp_path / "small.mkv") as small:
-        said, judge = small.header.extra["compression"], Judge(source)
+        said, judge = small.header.extra["compression"], Judge(source).look(source)
         assert small.header.cameras == ()
     assert np.array_equal(*map(circled, (said["imagined"], judge.imagined)))
     assert all(name.startswith("imagined") for name in said["cameras"])
@@ -137,7 +137,7 @@ def test_a_scene_whose_cameras_see_nothing_is_refused(tmp_path):
 
 def test_what_lies_beside_all_imagined_pictures_stays(tmp_path):
     with open_scene(still_scene(tmp_path / "scene.mkv", 200)) as scene:
-        segment, header, judge = scene.segment(0), scene.header, Judge(scene)
+        segment, header, judge = scene.segment(0), scene.header, Judge(scene).look(scene)
     key = Codes(segment.key.xyz.copy(), segment.key.attributes.copy())
     key.xyz[0] = 32768, 32768, 65535  # straight above all cameras, which look down on the others
     means = header.quantizer.decode(key).means[:1]

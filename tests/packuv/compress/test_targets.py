@@ -63,7 +63,7 @@ def wrong(tmp_path_factory):
 def test_targets_are_filmed_pictures_of_fitted_cameras_and_lossless_ones(lossless, footage):
     rng = np.random.default_rng(0)
     with open_scene(lossless) as scene:
-        targets = Targets(Views(footage.cameras[:2]), Judge(scene, footage).filmed, near=NEAR)
+        targets = Targets(Views(footage.cameras[:2]), Judge(scene).look(scene, footage).filmed, near=NEAR)
         found = [targets.draw(2, lambda: scene.gaussians(2), rng) for _ in range(60)]
     filmed = [target for target in found if target.response is not PLAIN]
     assert {target.camera.name for target in filmed} == {"cam0"}  # of the second there is no such frame
@@ -95,9 +95,15 @@ def test_a_pull_is_the_derivative_of_half_the_squared_error(footage):
 def test_footage_makes_better_pictures_than_the_scene_it_was_fitted_to(wrong, footage, tmp_path):
     goal = Goal(ratio=1.8)
     blind = compress(wrong, tmp_path / "blind.mkv", goal, iterations=60)
-    seeing = compress(wrong, tmp_path / "seeing.mkv", goal, footage=footage, iterations=60)
+    told = list[float]()
+    seeing = compress(
+        wrong, tmp_path / "seeing.mkv", goal, footage=footage, iterations=60,
+        progress=lambda done, total, note="": told.append(done / total),
+    )  # fmt: skip
+    assert told == sorted(told)
+    assert 0.5 < told[-1] <= 1
     with open_scene(wrong) as scene:
-        judge = Judge(scene, footage)
+        judge = Judge(scene).look(scene, footage)
     lost = {name: judge.errors(tmp_path / f"{name}.mkv").lost_db for name in ("blind", "seeing")}
     assert seeing.ratio >= 1.8 <= blind.ratio
     assert lost["seeing"] == pytest.approx(seeing.loss_db, abs=1e-9)
@@ -110,29 +116,35 @@ def test_footage_makes_better_pictures_than_the_scene_it_was_fitted_to(wrong, fo
 
 
 def test_footage_without_a_picture_to_judge_by_is_refused(lossless, footage, tmp_path):
+    told = list[tuple[float, float]]()
+
+    def progress(done: float, total: float, note: str = "") -> None:
+        told.append((done, total))
+
     blank = Footage(footage._videos, np.where(np.arange(3) == 2, -1, footage.frames), footage.lenses)
     with pytest.raises(ValueError, match="compared with what cam2 filmed, but the capture has no picture"):
-        compress(lossless, tmp_path / "small.mkv", Goal(ratio=1.8), footage=blank)
+        compress(lossless, tmp_path / "small.mkv", Goal(ratio=1.8), footage=blank, progress=progress)
     assert not list(tmp_path.iterdir())
+    assert [done for done, _ in told] == [*range(1, 9 + 2 + 6 + 1)]  # drawn, then filmed: first ones, and all
 
 
 def test_a_camera_that_films_something_else_is_not_followed(lossless, footage):
     others = dict(footage._videos)
     others["cam0"] = others["cam2"]
     with open_scene(lossless) as scene:
-        found = Judge(scene, Footage(others, footage.frames, footage.lenses)).filmed
+        found = Judge(scene).look(scene, Footage(others, footage.frames, footage.lenses)).filmed
         assert found.followed == ("cam1",)
         assert [*found.unfollowed] == ["cam0"]
         assert "dB to the scene, others" in found.unfollowed["cam0"]
-        assert not Judge(scene, footage).filmed.unfollowed
+        assert not Judge(scene).look(scene, footage).filmed.unfollowed
         without = Footage(others, np.where(np.arange(3) == 1, -1, footage.frames), footage.lenses)
-        assert Judge(scene, without).filmed.unfollowed == {"cam1": "no picture at frames 1, 3, 5"}
-        assert Judge(scene).filmed is None
+        assert Judge(scene).look(scene, without).filmed.unfollowed == {"cam1": "no picture at frames 1, 3, 5"}
+        assert Judge(scene).look(scene).filmed is None
 
 
 def test_the_larger_loss_of_held_out_and_of_fitted_cameras_counts(lossless, wrong, footage):
     with open_scene(lossless) as scene, open_scene(wrong) as other:
-        filmed = Judge(scene, footage).filmed
+        filmed = Judge(scene).look(scene, footage).filmed
         right, moved = filmed._levels(scene), filmed._levels(other)
         lost = [right[group] - moved[group] for group in (True, False)]
         assert filmed.lost_db(other) == max(lost)
