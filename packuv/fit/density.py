@@ -39,8 +39,9 @@ class DensityOptions:
     """A Gaussian with a standard deviation above this many radii is split, one below is cloned"""
     least_views: int = 2
     """Cameras that must show a Gaussian of what is fitted first, when `SUPPORTED_AT` tells; one that does so from afar
-    counts as all. Others are pruned: nobody sees them, or one camera alone explains its picture by them, close before
-    it, where they hide what others would see. 0 keeps all"""
+    counts as all. Others are pruned: hardly anybody sees them, or one camera alone explains its picture by them, close
+    before it, where they hide what others would see. What no picture holds stays: it continues what is beside it.
+    0 keeps all"""
     least_shown: float = 0.05
     """Blending weight from which on a camera shows a Gaussian, as a share of a picture's pixels for each of the cap.
     With 0.5 "basketball" loses 0.7 dB where nothing moves: small ones are detail"""

@@ -158,11 +158,13 @@ class ResidentSolver(Solver):
         rows, density = self._left().rows, self._options.density
         raster, degree = RasterOptions(self.bounds.near, device=self._options.device), self.model.gaussians.sh_degree
         views = torch.zeros(len(rows), dtype=torch.int64, device=MEMORY)
+        held = torch.zeros(len(rows), dtype=torch.bool, device=MEMORY)
         for shot in shots:
             rendering = draw(rows.drawn, shot.camera, options=raster, sh_degree=degree, weights=True)
             views += views_showing(rendering, rows.masters[0], shot.camera, density)
+            held |= rendering.weights > 0
         self._come_home()
-        return (views >= density.least_views).cpu().numpy()
+        return (~held | (views >= density.least_views)).cpu().numpy()
 
     def _on_gpu(self, shot: Shot) -> ShotOnGpu:
         held = self._shots.get(shot.camera.name)

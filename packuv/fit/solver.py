@@ -347,13 +347,14 @@ class Solver:
         return prune(self.model, self.gradient, taken, bounds=self.bounds, options=options.density, uv=options.uv)
 
     def supported(self, shots: Sequence[Shot]) -> np.ndarray:
-        """Rows that enough cameras show, bool [N]; for a fit of all that these see."""
+        """Rows that enough cameras show, or that no picture holds, bool [N]; for a fit of all that cameras see."""
         raster, density = RasterOptions(self.bounds.near, device=self._options.device), self._options.density
-        views = np.zeros(len(self.model), np.int64)
+        views, held = np.zeros(len(self.model), np.int64), np.zeros(len(self.model), bool)
         for shot in shots:
             rendering = render(self._decoded(), shot.camera, options=raster, weights=True, arena=self._arena)
             views += views_showing(rendering, self.model.gaussians.means, shot.camera, density)
-        return views >= density.least_views
+            held |= rendering.weights > 0
+        return ~held | (views >= density.least_views)
 
     def _change_density(self, of: int, grow_from: int) -> None:
         """Prune, then grow towards the cap."""

@@ -112,7 +112,7 @@ class UsePlate(Stage):
 class FitBackdrop(Stage):
     """Fit what stands still, from which all keyframes start: state.npz and key.json, with the quantizer of all."""
 
-    name, version = "backdrop", 5
+    name, version = "backdrop", 6
     take: Take
     background: Key
     options: FirstOptions
@@ -216,7 +216,7 @@ class PatchBackdrop(Stage):
 class FitFirst(Stage):
     """Fit the keyframe that a chain without backdrop starts with: state.npz and key.json, with the quantizer of all."""
 
-    name, version = "key", 11
+    name, version = "key", 12
     take: Take
     instant: int
     options: FirstOptions

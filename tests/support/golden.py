@@ -42,7 +42,8 @@ SETTINGS: dict[str, Any] = {
         "density": {"cap": 400},
     },
 }
-LATE_VECTORS = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+LATE_VECTORS = "X86_V4 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+"""Of NumPy, by the names of its versions 2.4 and before"""
 ENVIRONMENT = {
     # Digests hold for one set of instructions: that of Intel's Haswell, which every x86-64 machine since has.
     "NUMBA_CPU_NAME": "haswell",

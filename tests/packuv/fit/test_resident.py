@@ -149,8 +149,10 @@ def test_who_is_supported_is_the_cpus():
     found = []
     for device in ("cpu", "cuda"):
         tried = solver(device, density=DensityOptions(cap=16))
+        tried.model.gaussians.means[3] -= 50 * view("a").camera_from_world[2, :3].astype(np.float32)  # behind cameras
         found.append(tried.supported(shots()))
     assert np.array_equal(*found)
+    assert found[0][3]
     assert 0 < found[0].sum() < 10
 
 

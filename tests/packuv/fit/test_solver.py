@@ -43,6 +43,17 @@ def solver(**changes: Any) -> Solver:
     return Solver(Model(scene(60, degree=0)), Bounds(np.zeros(3), 2.0, OPTIONS.near), options, np.random.default_rng(0))
 
 
+def test_what_no_picture_holds_stays_and_what_hardly_shows_goes():
+    tried = solver(density=DensityOptions(cap=60, least_views=2))
+    (axis,) = {tuple(view.camera_from_world[2, :3]) for view in VIEWS}
+    tried.model.gaussians.means[:5] -= 50 * np.float32(axis)  # behind all cameras
+    tried.model.gaussians.opacity_logits[6:10] = -4.5  # a picture holds some of their pixels, faintly
+    supported = tried.supported(shots(0.0))
+    assert supported[:5].all()
+    assert not supported[6:10].any()
+    assert supported[10:].mean() > 0.5
+
+
 def test_a_frame_that_is_right_stops_soon():
     _, loss, count = settled(shots(0.0), LIMIT, near_jitter=0.0)
     assert count <= 72
