@@ -232,6 +232,14 @@ def test_labels_of_two_kinds_are_said() -> None:
     assert found["a"].notes == ()
 
 
+def test_labels_of_two_kinds_are_said_where_they_lie_apart() -> None:
+    """Drop-frame labels of 10 o'clock are 36 s from others of 29.97 frames."""
+    times = 36_000 * 10**9 + np.arange(20, dtype=np.int64) * PERIOD_NS
+    found = together({"a": codes(times, DAY_NS - 86_400_000), "b": codes(times + 36 * 10**9, DAY_NS + 86_400_000)})
+    with pytest.raises(ValueError, match=r"an epoch and a unit\? b: its times start over .* drop-frame and the others"):
+        align(found)
+
+
 # Containers
 
 
