@@ -66,7 +66,7 @@ from tasks.stages.light import read_damage, read_steady
 from tasks.stages.masks import doubts
 from tasks.stages.plan import Plan
 from tasks.stages.synchronize import FOOTAGE, UNREAD, read_videos
-from tasks.stages.track import read_curve, read_keyframes
+from tasks.stages.track import read_curve, read_keyframes, repeats_told
 
 WHOLE = (SCENE, PAGE_NAME, JSON_NAME, "run.json")
 """Files of a run that came to its end, in its folder"""
@@ -432,6 +432,8 @@ def _footage_notes(run: Remains) -> Iterator[str]:
         yield from (damage_told(name, facts) for name, facts in read_damage(light).items())
     elif run.folder("points"):
         yield "damaged pictures were not looked for, since light.enabled is false"
+    if motion := run.made.get("motion"):
+        yield from repeats_told(run.store.receipt(motion).notes)
 
 
 def _content(folder: Path | None) -> Content | None:

@@ -285,6 +285,7 @@ def align(timecodes: Mapping[str, Timecodes], options: AlignOptions | None = Non
         raise ValueError(
             f"no frame of any camera lies within {tolerance} ns of a frame of {reference!r}; "
             f"the cameras' times span {_spans(times)}: do they share a clock, an epoch and a unit?"
+            f"{_read_told(timecodes)}"
         )
     if not (groups.frames >= 0).all(axis=1).any():
         raise ValueError(_never_complete(groups, times, tolerance))
@@ -567,6 +568,12 @@ def _notes(report: CameraReport, sync: SyncReport) -> list[str]:
 
 def _spans(times: Mapping[str, np.ndarray]) -> str:
     return ", ".join(f"{camera} {own[0]} to {own[-1]}" for camera, own in list(times.items())[:4])
+
+
+def _read_told(timecodes: Mapping[str, Timecodes]) -> str:
+    """What had to be assumed to read them, which may be why they lie apart."""
+    notes = [f"{camera}: {note}" for camera, codes in timecodes.items() for note in codes.notes]
+    return "".join(f" {note}" for note in notes[:4])
 
 
 def _read_json(folder: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from sync.clock import ClockMode
 from sync.natural import natural_key
 from sync.offsets import MOST_OFFSET_S, find_offsets, offset_notes, read_offsets
 from sync.pictures import PICTURE_SUFFIXES, holds_pictures, is_picture, list_pictures
-from sync.probe import VideoInfo, container_timecodes, probe_video
+from sync.probe import CONTAINER_TIMES, VideoInfo, container_timecodes, probe_video
 from sync.timecode import NANOSECONDS, SUFFIXES, Timecodes, parse_rate, read_shared_timecodes, read_timecodes, together
 
 VIDEO_FOLDERS = ("videos", "images", "rgbs", "ims")
@@ -37,6 +37,8 @@ RATE_OFF = 0.1
 """Share by which timecodes may run faster or slower than the container"""
 LABELS_APART = 1.5
 """Frames that a label may be off a timecode file: it counts whole ones"""
+UNSET = ("00:00:00:00", "00:00:00;00")
+"""Labels that, where all cameras begin with them, nobody set: they count from where each recording began"""
 BEGUN_APART_S, CLOCKS_SET_S = 1.5, 3600
 """Seconds that creation_time, which counts whole ones, must lie apart to mean something, and at most, or a clock is not
 set"""
@@ -306,7 +308,7 @@ def load_timecodes(
     if not capture.timecodes:
         if clock is not ClockMode.CONTENT:
             told = _beside_labels(told, infos)
-        begun = {name: infos[name].begun_ns for name in told if not infos[name].start_label}
+        begun = {name: infos[name].begun_ns for name, codes in told.items() if codes.source == CONTAINER_TIMES}
         told = {camera: codes.noting(*_begun_notes(camera, begun)) for camera, codes in told.items()}
     return with_offsets(capture, told, clock)
 
@@ -367,7 +369,10 @@ def _read_offsets(capture: Capture, clock: ClockMode) -> dict[str, Decimal]:
 def _told_timecodes(capture: Capture, infos: Mapping[str, VideoInfo]) -> dict[str, Timecodes]:
     """As files and containers tell them."""
     if not capture.timecodes:
-        return together({camera: container_timecodes(infos[camera]) for camera in capture.cameras})
+        told = {camera: container_timecodes(infos[camera]) for camera in capture.cameras}
+        if all(info.start_label in UNSET and info.heard_ns is None for info in infos.values()):
+            told = {camera: replace(codes, source=CONTAINER_TIMES) for camera, codes in told.items()}
+        return together(told)
     frames = {camera: infos[camera].frame_count for camera in capture.cameras}
     periods = {camera: period for camera in capture.cameras if (period := _period_ns(infos[camera]))}
     rates = {camera: infos[camera].rate for camera in capture.cameras if not infos[camera].numbered}
@@ -468,6 +473,7 @@ def file_timecodes(
                 rate=counted[camera],
                 column=settings.timecode_column,
                 period_ns=periods.get(camera),
+                others=capture.cameras,
             )
             for camera in frames
         }
@@ -634,7 +640,7 @@ def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]
     there = [path for path in there if path.is_file() and not path.name.startswith(".")]
     files = [path for path in there if path.suffix.lower() in SUFFIXES]
     unknown = [path for path in there if path.suffix.lower() not in {*SUFFIXES, *BESIDE_TIMECODES}]
-    if unread := [path for path in unknown if path.stem in videos or not files]:
+    if unread := [path for path in unknown if camera_of(path) in videos or not files]:
         raise ValueError(
             f"timecodes are read from files that end in {', '.join(SUFFIXES)}, but {unread[0]} does not; rename it, "
             "convert it, or take it out of the folder"
@@ -643,7 +649,7 @@ def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]
     shared = [
         path
         for path in files
-        if path.stem not in videos
+        if camera_of(path) not in videos
         and (path.name == SHARED_TIMECODES or (alone and path.suffix.lower() in SHARED_SUFFIXES))
     ]
     if shared and alone:
@@ -658,10 +664,20 @@ def _find_timecodes(folder: Path, videos: Mapping[str, Path]) -> dict[str, Path]
     return found
 
 
+def camera_of(path: Path) -> str:
+    """The camera that a file or folder is called after."""
+    return composed(path.name if path.is_dir() else path.stem)
+
+
+def composed(name: str) -> str:
+    """With umlauts as one character: systems and editors differ in how they write them."""
+    return unicodedata.normalize("NFC", name)
+
+
 def by_camera(folder: Path, files: Iterable[Path]) -> dict[str, Path]:
     """In natural order. Raises ValueError for two of one camera."""
     found: dict[str, Path] = {}
-    named = {path: path.name if path.is_dir() else path.stem for path in files}
+    named = {path: camera_of(path) for path in files}
     for path in sorted(named, key=lambda path: (natural_key(named[path]), path.name)):
         name = named[path]
         if name in found:
@@ -748,7 +764,9 @@ def _checked(path: Path, key: str, value: Any) -> Any:
     texts = value if many else [value]
     if not isinstance(texts, list) or not all(isinstance(text, str) and text for text in texts):
         raise ValueError(f"{path}: {key} must be {'a list of texts' if many else 'a text'}, but is {value!r}")
-    return tuple(texts) if many else value
+    if key in ("reference", "held_out", "ignore"):
+        texts = [composed(text) for text in texts]
+    return tuple(texts) if many else texts[0]
 
 
 def _checked_offsets(path: Path, value: Any) -> dict[str, Decimal]:
@@ -761,7 +779,7 @@ def _checked_offsets(path: Path, value: Any) -> dict[str, Decimal]:
                 f"{path}: time_offset_s of {camera!r} must be a number of seconds, at most {MOST_OFFSET_S} either "
                 f"way, but is {seconds!r}"
             )
-    return {camera: Decimal(seconds) for camera, seconds in value.items()}
+    return {composed(camera): Decimal(seconds) for camera, seconds in value.items()}
 
 
 def _checked_tables(path: Path, key: str, tables: list[Any]) -> tuple[dict[str, Any], ...]:

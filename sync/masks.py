@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sync.capture import Capture, by_camera, cameras_in, suggest
+from sync.capture import Capture, by_camera, camera_of, cameras_in, suggest
 from sync.natural import natural_key
 from sync.pictures import Pictures, holds_pictures, is_picture, list_pictures
 from sync.probe import probe_video
@@ -82,8 +82,7 @@ def masks_unread(capture: Capture) -> Iterator[str]:
 
 
 def _of_cameras(folder: Path, capture: Capture) -> bool:
-    names = {path.name if path.is_dir() else path.stem for path in cameras_in(folder)}
-    return not names.isdisjoint(capture.videos)
+    return not {camera_of(path) for path in cameras_in(folder)}.isdisjoint(capture.videos)
 
 
 def seems_masks(path: Path) -> bool:

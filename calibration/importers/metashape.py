@@ -67,6 +67,8 @@ def _camera(sensor: Element, placed: np.ndarray, what: str) -> Camera:
 
     f = of("f") or of("fx")
     k1, k2, k3, k4, p1, p2 = (of(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if of("p3") or of("p4"):
+        raise ValueError(f"{what}: Metashape's p3 and p4 have no counterpart in OpenCV's model; optimize without them")
     if abs(of("b2")) * height / 2 / f > _MOST_SKEW_PX:
         raise ValueError(f"{what}: pixels must be upright, but b2 is {of('b2')}; optimize without b2")
     pinhole = (width, height, f + of("b1"), f, width / 2 + of("cx"), height / 2 + of("cy"), placed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -23,7 +23,7 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".npy")
 """Of files with timecodes"""
 
 
-_UNIT_END = re.compile(r"[ _]?[\[(]?(?<=[ _\[(])(?:ns|us|ms|s)[\])]?$")
+_UNIT_END = re.compile("[ _]?[\\[(]?(?<=[ _\\[(])(?:ns|[u\u00b5\u03bc]s|ms|s)[\\])]?$")
 """Of a column that is named after a camera: cam01_us, cam01 [us]"""
 
 
@@ -34,6 +34,7 @@ def read_timecodes(
     rate: Fraction | None = None,
     column: str | None = None,
     period_ns: int | None = None,
+    others: Collection[str] = (),
 ) -> Timecodes:
     """Read one camera's timecodes from a file with one of `SUFFIXES`.
 
@@ -43,6 +44,7 @@ def read_timecodes(
         rate: frames per second, needed for SMPTE labels only.
         column: name of the time column, where a table has more than one; its number, from 1, where it has no header.
         period_ns: time between two frames of the video, by which the unit is told where nothing names it.
+        others: cameras of which it is said if all rows bear the name of one.
 
     Raises:
         FileNotFoundError: no such file.
@@ -56,6 +58,7 @@ def read_timecodes(
     if timecodes is None:
         table = _table(path, kind, data, column)
         timecodes = table_timecodes(table, _rows_of(table, camera), rate, column, period_ns)
+        timecodes = timecodes.noting(*_strange_rows(table, camera, others))
     _check_gaps(path, timecodes)
     return timecodes
 
@@ -154,6 +157,13 @@ def _rows_of(table: Table, camera: str | None) -> np.ndarray | None:
     if camera is None and len(ids) > 1:
         raise ValueError(f"{table.path} holds cameras {sorted(ids)}; say which one to read")
     return table.rows_of(match_camera(camera, ids) if camera is not None and len(ids) > 1 else ids[0])
+
+
+def _strange_rows(table: Table, camera: str | None, others: Collection[str]) -> Iterator[str]:
+    """That the rows are those of another camera, by what they say."""
+    ids = [] if table.camera is None else table.cameras
+    if len(ids) == 1 and ids[0] != camera and ids[0] in others:
+        yield f"the rows of {table.path.name} say that they are those of {ids[0]}; they are taken for {camera}'s"
 
 
 def _check_gaps(path: Path, timecodes: Timecodes) -> None:

@@ -14,6 +14,8 @@ from sync.tree import TIME_LIMIT_NS
 CYCLES = tuple(1 << bits for bits in (16, 24, 30, 31, 32, 33, 40, 48))
 """Numbers at which counters start over"""
 DAY_NS = 86_400 * NANOSECONDS
+CLOCK_CYCLES_NS = tuple(seconds * NANOSECONDS for seconds in (60, 128, 3600, 7 * 86_400))
+"""After which clocks begin at 0 that have no minutes, hours or weeks; 128 s are those of FireWire's cameras"""
 LONGEST_STALL = 10
 """Frame periods that may pass while a counter starts over"""
 FEWEST_PERIODS = 100
@@ -98,7 +100,8 @@ def unwrapped(times_ns: np.ndarray, unit_ns: int) -> tuple[np.ndarray, int, int]
     """Times of a counter that starts over when it is full, carried on; int64 [n] in units of `unit_ns` nanoseconds.
 
     A step back counts as a full counter if the time goes on, after one of `CYCLES` or a day, by what ten frames take at
-    most. Anything else that runs backwards is left as it is.
+    most, or after one of `CLOCK_CYCLES_NS` where all times lie in a single one. Anything else that runs backwards is
+    left as it is.
 
     Returns:
         The times, after how many ns the counter starts over (0: it did not), and how often it did.
@@ -106,7 +109,8 @@ def unwrapped(times_ns: np.ndarray, unit_ns: int) -> tuple[np.ndarray, int, int]
     steps = np.diff(times_ns)
     forward = steps[steps > 0]
     period = int(np.median(forward)) if len(forward) else 0
-    for cycle in sorted({*(bits * unit_ns for bits in CYCLES), DAY_NS}):
+    within = [cycle for cycle in CLOCK_CYCLES_NS if times_ns.min() >= 0 and times_ns.max() < cycle]
+    for cycle in sorted({*(bits * unit_ns for bits in CYCLES), DAY_NS, *within}):
         if not FEWEST_PERIODS * period <= cycle < TIME_LIMIT_NS or not period:
             continue
         wraps = (steps < 0) & (steps + cycle > 0) & (steps + cycle <= LONGEST_STALL * period)

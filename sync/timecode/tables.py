@@ -76,10 +76,12 @@ class Table:
 
 
 def csv_table(path: Path, data: bytes, column: str | None = None) -> Table:
-    """A table with a header, separated by comma, semicolon or tab; without a header, as `number_table`."""
+    """A table with a header, separated by comma, semicolon or tab; without a header, as `number_table`. Comments may
+    stand before the header."""
     lines = data.splitlines()
-    header = lines[0].decode(errors="replace") if lines else ""
-    if not re.search("[A-Za-z]", header) or header.startswith("#") or _ISO_START.match(header):
+    first = next((number for number, line in enumerate(lines) if _is_filled(line)), 0)
+    header = lines[first].decode(errors="replace") if lines else ""
+    if not re.search("[A-Za-z]", _EXPONENT.sub("", header)) or header.startswith("#") or _ISO_START.match(header):
         return number_table(path, data, column)
     delimiter = max(",;\t", key=header.count)
     names = [name.strip().strip('"') for name in header.split(delimiter)]
@@ -89,7 +91,7 @@ def csv_table(path: Path, data: bytes, column: str | None = None) -> Table:
         table = pcsv.read_csv(
             pa.BufferReader(data),
             # a row number in messages needs the serial reader
-            read_options=pcsv.ReadOptions(column_names=names, skip_rows=1, use_threads=False),
+            read_options=pcsv.ReadOptions(column_names=names, skip_rows=first + 1, use_threads=False),
             parse_options=pcsv.ParseOptions(delimiter=delimiter),
             convert_options=pcsv.ConvertOptions(
                 column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
@@ -282,10 +284,13 @@ def _json_text(item: Any, name: str, place: str) -> str:
     return str(item[name]).strip()
 
 
+_EXPONENT = re.compile(r"\d[eE][+-]?\d")
+_MICRO = re.compile("[\u00b5\u03bc\ufffd](?=s)")
+"""The micro sign and the Greek letter, and what becomes of them where a file is in no Unicode"""
 _ISO_START = re.compile(r"\d{4}[-/]\d\d[-/]\d\d[T ]\d\d:\d\d")
 _FLOAT = re.compile(r"\d+\.\d*(?:e\+\d\d)?")
 
 
 def plain(name: str) -> str:
-    """Column name in lower case with underscores: 'Timestamp [ns]' is timestamp_ns."""
-    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    """Column name in lower case with underscores: 'Timestamp [ns]' is timestamp_ns, 'Time (\u00b5s)' time_us."""
+    return re.sub(r"[^a-z0-9]+", "_", _MICRO.sub("u", name.lower())).strip("_")

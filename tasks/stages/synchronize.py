@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 
 from sync.align import AlignOptions, FrameGroups, SyncReport, align, save_index
 from sync.capture import (
+    SETTINGS,
     Capture,
     find_capture,
     load_durations,
@@ -78,6 +79,7 @@ class Synchronize(Stage):
         timing = timing_notes(found, infos, self.options.clock)
         notes = [
             *found.notes,
+            *_copies(self.videos.sha256),
             *picture_notes(found, infos),
             *timing,
             *(note for info in infos.values() for note in info.notes),
@@ -93,6 +95,17 @@ class Synchronize(Stage):
             _offsets(found, self.options.clock),
         ) != (self.fps, self.timecode_column, self.time_offset_s):
             raise ValueError(f"files or settings of {found.folder} changed while they were read; run the command again")
+
+
+def _copies(sha256: Mapping[str, str]) -> Iterator[str]:
+    """Videos that are other cameras', too, by their content."""
+    first = dict[str, str]()
+    for camera, content in sha256.items():
+        if (other := first.setdefault(content, camera)) != camera:
+            yield (
+                f"the videos of {other} and {camera} are the same to the byte, so one camera's recording is missing "
+                f"and its place is wrong: copy it again, or list one of them under 'ignore' in {SETTINGS}"
+            )
 
 
 def synchronize(workshop: Workshop, options: AlignOptions, starts: Key | None) -> Synchronize:

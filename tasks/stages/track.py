@@ -12,6 +12,7 @@ import numpy as np
 
 from packuv.files import save_json
 from packuv.fit.patch import in_one_place
+from packuv.footage import Views
 from packuv.motion import (
     MotionCache,
     MotionOptions,
@@ -30,6 +31,15 @@ from tasks.stages.footage import Footage, Take
 MOTION, KEYFRAMES, PATCHES = "motion", "keyframes.json", "patches.npz"
 RAFT = "raft"
 """Name of its weights among the files that a stage reads"""
+REPEATS = "repeats"
+"""Key in the notes of cameras that repeat pictures; missing where none does"""
+FEWEST_REPEATS, LEAST_REPEATED = 3, 0.1
+"""Pictures that a camera must repeat to be named, and their share of all that follow another one"""
+COMPARED = 4
+"""Pairs of pictures in which nothing moves that are compared, evenly spread"""
+MOST_UNLIKE = 0.05
+"""Share of a picture's pixels by which a repeated one may differ: codecs mend it a little (0.7 to 3 % measured), while
+noise of pictures that are filmed anew changes far more"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +58,47 @@ class FindMotion(Stage):
         folder.rename(work.out / MOTION)
         measured = cache.previous >= 0  # nothing where there is a single instant
         share = float(np.nanmean(_shares(cache))) if measured.any() else 0.0
-        return {"pictures": int(measured.sum()), "moving_share": share}
+        repeats = find_repeats(cache, views)
+        return {"pictures": int(measured.sum()), "moving_share": share, **({REPEATS: repeats} if repeats else {})}
 
     def raft_model(self) -> Raft | None:
         """What estimates optical flow instead of DIS."""
         return None
+
+
+def find_repeats(cache: MotionCache, views: Views) -> dict[str, list[int]]:
+    """Cameras that give one picture several times while most others see something move: how many of their pictures
+    are still then, and how many follow another one. A sample of the still ones must be the same but for what codecs do:
+    what cameras film anew has noise."""
+    there = cache.previous >= 0
+    moves = there & (cache.steps["share"] > 0)
+    found = {}
+    for column, name in enumerate(cache.names):
+        own, others = moves[:, column], np.delete(np.arange(len(cache.names)), column)
+        alive = 2 * moves[:, others].sum(axis=1) > there[:, others].sum(axis=1)
+        still, steps = np.flatnonzero(there[:, column] & ~own & alive), int(there[:, column].sum())
+        if len(still) >= max(FEWEST_REPEATS, LEAST_REPEATED * steps):
+            some = still[np.linspace(0, len(still) - 1, COMPARED).round().astype(int)]
+            if all(_unlike(views, column, cache.previous[t, column], t) <= MOST_UNLIKE for t in some):
+                found[name] = [len(still), steps]
+    return found
+
+
+def _unlike(views: Views, camera: int, *instants: int) -> float:
+    """Share of the pixels that differ between two instants."""
+    before, after = (views.pixels(camera, instant, remember=False) for instant in instants)
+    return 1.0 if before is None or after is None else float((before != after).any(axis=2).mean())
+
+
+def repeats_told(notes: Notes) -> Iterator[str]:
+    """Of the notes of FindMotion, for people."""
+    for name, (still, steps) in notes.get(REPEATS, {}).items():
+        why = "is its lens covered, or did it hang?" if still == steps else "did it hang, or was its rate converted?"
+        yield (
+            f"{name}: {still} of {steps} pictures repeat the one before, where most cameras see something move: {why} "
+            "Repeated pictures count as filmed at their times; list the camera under 'ignore' in capture.toml if they "
+            "are wrong"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -493,6 +493,7 @@ def test_a_pickle_that_would_run_code_is_refused(tmp_path):
         (('type="frame"', 'type="spherical"'), "spherical lens has no counterpart"),
         (('component_id="0" label="cam01"', 'component_id="1" label="cam01"'), "aligned in 2 pieces"),
         (("</f>", "</f><b2>50</b2>"), "b2 is 50.0; optimize without b2"),
+        (("</f>", "</f><p4>0.01</p4>"), "p3 and p4 have no counterpart"),
     ],
 )
 def test_metashape_models_without_a_counterpart_are_refused(tmp_path, change, message):

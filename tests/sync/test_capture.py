@@ -24,6 +24,7 @@ from sync.capture import (
     probe_capture,
 )
 from sync.clock import ClockMode
+from sync.masks import find_masks
 from sync.probe import ColourTags, VideoInfo
 from sync.timecode import Timecodes
 
@@ -237,6 +238,24 @@ def test_timecodes_are_found_by_camera_or_shared(tmp_path: Path) -> None:
     }
     shared = make_capture(tmp_path / "shared", *VIDEOS, "timecodes/timestamps.csv")
     assert set(find_capture(shared).timecodes.values()) == {shared / "timecodes" / "timestamps.csv"}
+
+
+@pytest.mark.parametrize(("own", "other"), [("NFD", "NFC"), ("NFC", "NFD")])
+def test_umlauts_are_the_same_however_they_are_written(tmp_path: Path, own: str, other: str) -> None:
+    def written(form: str) -> str:
+        return unicodedata.normalize(form, "S\u00fcd")  # type: ignore[arg-type]  # the form is one of two
+
+    name = written(other)
+    files = (f"videos/{written(own)}.mp4", "videos/b.mp4", "videos/c.mp4", f"timecodes/{name}.txt", "timecodes/b.txt")
+    masks = f"Masks/{name}/0.png"
+    settings = f'held_out = ["{name}"]\nreference = "b"\ntime_offset_s = {{ "{name}" = 1 }}\n'
+    capture = find_capture(make_capture(tmp_path, *files, "timecodes/c.txt", masks, settings=settings))
+    assert capture.cameras == ("b", "c", written("NFC"))
+    assert capture.timecodes[written("NFC")].is_file()
+    assert capture.videos[written("NFC")].is_file()
+    assert capture.settings.held_out == (written("NFC"),)
+    assert list(capture.settings.time_offset_s) == [written("NFC")]
+    assert find_masks(capture) == {written("NFC"): tmp_path / "Masks" / name}
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sync.align import AlignOptions, SyncReport, align
-from sync.capture import find_capture, load_timecodes
+from sync.capture import find_capture, load_timecodes, probe_capture
 from sync.probe import container_timecodes, probe_video
 from sync.timecode import Timecodes, frame_to_label, label_to_frame, read_timecodes, together
 from sync.timecode.series import CYCLES, DAY_NS, unwrapped
@@ -170,6 +170,24 @@ def test_a_counter_that_starts_over_is_carried_on(cycle: int, ahead: int, turns:
     assert np.array_equal(np.diff(found), np.diff(times))
 
 
+@pytest.mark.parametrize("seconds", [60, 128, 3600, 7 * 86_400])
+def test_a_clock_without_its_hours_is_carried_on(seconds: int) -> None:
+    cycle = seconds * 10**9
+    times = cycle - 30 * PERIOD_NS + np.arange(60, dtype=np.int64) * PERIOD_NS
+    found, seen, count = unwrapped(times % cycle, 1)
+    assert (seen, count) == (cycle, 1)
+    assert np.array_equal(found, times)
+
+
+def test_a_clock_that_was_set_back_is_left_alone() -> None:
+    """By a minute, beyond which it had counted before: no counter of minutes does."""
+    times = EPOCH_NS + np.arange(60, dtype=np.int64) * PERIOD_NS
+    times[30:] -= 60 * 10**9
+    found, *turns = unwrapped(times, 1)
+    assert turns == [0, 0]
+    assert np.array_equal(found, times)
+
+
 @given(st.lists(st.integers(0, 10**12), min_size=2, max_size=40, unique=True), st.sampled_from([1, 1000, 10**6]))
 def test_times_that_go_forward_are_left_alone(times: list[int], unit: int) -> None:
     ordered = np.array(sorted(times), np.int64) * unit
@@ -214,6 +232,14 @@ def test_labels_of_two_kinds_are_said() -> None:
     assert found["a"].notes == ()
 
 
+def test_labels_of_two_kinds_are_said_where_they_lie_apart() -> None:
+    """Drop-frame labels of 10 o'clock are 36 s from others of 29.97 frames."""
+    times = 36_000 * 10**9 + np.arange(20, dtype=np.int64) * PERIOD_NS
+    found = together({"a": codes(times, DAY_NS - 86_400_000), "b": codes(times + 36 * 10**9, DAY_NS + 86_400_000)})
+    with pytest.raises(ValueError, match=r"an epoch and a unit\? b: its times start over .* drop-frame and the others"):
+        align(found)
+
+
 # Containers
 
 
@@ -243,6 +269,22 @@ def test_times_that_begin_at_0_wherever_a_recording_began_are_said(tmp_path: Pat
     _, report = align({name: container_timecodes(info) for name in "ab"})
     assert report.notes[0].startswith("times of a, b are those of the containers")
     assert SyncReport.from_json(json.loads(json.dumps(report.to_json()))) == report
+
+
+def test_labels_that_nobody_set_tell_no_start(tmp_path: Path) -> None:
+    """Of all cameras 00:00:00:00 is where each began; beside another label it is midnight."""
+
+    def noted(**labels: str) -> str:
+        for name, label in labels.items():
+            make_video(tmp_path / "videos" / f"{name}.mov", metadata={"timecode": label})
+        capture = find_capture(tmp_path)
+        _, report = align(load_timecodes(capture, probe_capture(capture)))
+        return " ".join(report.notes)
+
+    (tmp_path / "videos").mkdir()
+    assert noted(a="00:00:00:00", b="00:00:00:00").startswith("times of a, b are those of the containers")
+    assert "those of the containers" not in noted(a="00:00:00:00", b="00:00:00:01")
+    assert "those of the containers" not in noted(a="10:00:00:00", b="10:00:00:00")
 
 
 # Clocks and instants

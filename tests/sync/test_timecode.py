@@ -164,6 +164,9 @@ def test_scientific_notation_is_exact(tmp_path_factory: pytest.TempPathFactory, 
         ("timestamp_us", "1770341767841840.9014", 1770341767841840901),
         ("Timestamp [ms]", "1770341767841.840901", 1770341767841840901),
         ("time (s)", "1770341767.8418409006", 1770341767841840901),
+        ("Time [\u00b5s]", "1770341767841840.9014", 1770341767841840901),
+        ("Time (\u03bcs)", "1770341767841840.9014", 1770341767841840901),
+        ("Time (\u00b5s)".encode("latin-1"), "1770341767841840.9014", 1770341767841840901),
         ("frame_time", "25.000978699999997", 25000978700),
         ("frame_time", "25", 25000000000),
         ("timestamp", "25.000978699999997", 25000978700),
@@ -175,8 +178,10 @@ def test_scientific_notation_is_exact(tmp_path_factory: pytest.TempPathFactory, 
         ("cam_timestamp", "5e-05", None),
     ],
 )
-def test_units(tmp_path: Path, header: str, value: str, nanoseconds: int | None) -> None:
-    path = write(tmp_path / "a.csv", f"frame_number,{header}\n00001,{value}\n")
+def test_units(tmp_path: Path, header: str | bytes, value: str, nanoseconds: int | None) -> None:
+    path = tmp_path / "a.csv"
+    name = header if isinstance(header, bytes) else header.encode()
+    path.write_bytes(b"frame_number," + name + f"\n00001,{value}\n".encode())
     if nanoseconds is None:
         with pytest.raises(ValueError, match="unit of column 'cam_timestamp' is open"):
             read_timecodes(path)
@@ -189,6 +194,28 @@ def test_delimiters_quotes_and_byte_order_marks(tmp_path: Path, delimiter: str) 
     rows = [["frame_number", '"timestamp_ns"'], ["00001", "1000000000"], ["00002", "1033333333"]]
     text = "\ufeff" + "\r\n".join(delimiter.join(row) for row in rows) + "\r\n\r\n"
     assert columns(write(tmp_path / "a.csv", text)) == ([1000000000, 1033333333], [0, 1])
+
+
+def test_comments_may_stand_before_the_header(tmp_path: Path) -> None:
+    text = "# recorder 1.2\n\n#take 3\nframe,time_s\n7,1.0\n8,1.1\n"
+    assert columns(write(tmp_path / "a.csv", text)) == ([1_000_000_000, 1_100_000_000], [0, 1])
+    with pytest.raises(ValueError, match=r"a\.csv, line 6 \('8,x'\): expected a number"):
+        read_timecodes(write(tmp_path / "a.csv", text.replace("1.1", "x")))
+
+
+@pytest.mark.parametrize("head", ["", "# frame,time\n"])
+def test_numbers_with_exponents_are_no_header(tmp_path: Path, head: str) -> None:
+    """As `numpy.savetxt` writes them."""
+    rows = "".join(f"{k:.18e},{1 + k / 10:.18e}\n" for k in range(3))
+    assert columns(write(tmp_path / "a.csv", head + rows))[0] == [1_000_000_000, 1_100_000_000, 1_200_000_000]
+
+
+def test_rows_that_name_another_camera_are_said(tmp_path: Path) -> None:
+    path = write(tmp_path / "cam1.csv", "camera,time_s\ncam2,1.0\ncam2,1.1\n")
+    (note,) = read_timecodes(path, camera="cam1", others=["cam1", "cam2"]).notes
+    assert note == "the rows of cam1.csv say that they are those of cam2; they are taken for cam1's"
+    assert not read_timecodes(path, camera="cam1", others=["cam1", "2"]).notes
+    assert not read_timecodes(path, camera="cam2", others=["cam1", "cam2"]).notes
 
 
 @pytest.mark.parametrize(
@@ -223,6 +250,13 @@ def test_the_time_column_can_be_named(tmp_path: Path) -> None:
 
 
 CALISCOPE = "sync_index,port,frame_index,frame_time\n0,2,11,1.5\n0,1,5,1.50000001\n1,1,6,1.6\n1,2,10,1.4\n"
+
+
+@pytest.mark.parametrize("unit", ["us", "\u00b5s", "\u03bcs"])
+def test_columns_of_cameras_may_name_microseconds(tmp_path: Path, unit: str) -> None:
+    path = write(tmp_path / "t.csv", f"cam1 [{unit}],cam2 [{unit}]\n0,33333\n33333,66666\n")
+    found = read_shared_timecodes(path, ["cam1", "cam2"])
+    assert found["cam2"].times_ns.tolist() == [33_333_000, 66_666_000]
 
 
 def test_shared_tables_are_split_by_camera_and_ordered_by_frame_index(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from tasks.stages.clock import FindStarts
 from tasks.stages.content import OFFSETS, CompareContent, choose_windows, read_content
 from tasks.stages.footage import RIG, Take
 from tasks.stages.synchronize import Synchronize, read_starts, starts_of
-from tasks.stages.track import MOTION, FindMotion
+from tasks.stages.track import MOTION, REPEATS, FindMotion, repeats_told
 from tests.support.artefacts import build_here, put
 from tests.support.balls import FOCAL, camera_pose, covered
 from tests.support.balls import WIDTH as GRID
@@ -38,9 +38,15 @@ NAMES = tuple(f"cam{number}" for number in range(COUNT))
 MOTION_OPTIONS = MotionOptions(keep_flow=False, width=WIDTH)
 
 
-def film(folder: Path, late: dict[int, float], rates: dict[int, Fraction] | None = None) -> None:
+def film(
+    folder: Path,
+    late: dict[int, float],
+    rates: dict[int, Fraction] | None = None,
+    repeated: dict[int, list[int]] | None = None,
+) -> None:
     """A video for each camera, which begins `late` instants after the first; bright balls before a grey ramp. `rates`
-    are those of cameras that do not film 30 frames a second."""
+    are those of cameras that do not film 30 frames a second, `repeated` the numbers of the pictures that others have in
+    place of their own."""
     (folder / "videos").mkdir(parents=True)
     wall = np.linspace(40, 90, WIDTH * HEIGHT).astype(np.uint8)
     for number, name in enumerate(NAMES):
@@ -49,7 +55,7 @@ def film(folder: Path, late: dict[int, float], rates: dict[int, Fraction] | None
         with av.open(str(folder / "videos" / f"{name}.mkv"), "w") as container:
             stream = container.add_stream("ffv1", rate=rate)
             stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "bgr0"
-            for seen in covered(number, COUNT, times, WIDTH, HEIGHT):
+            for seen in covered(number, COUNT, times[(repeated or {}).get(number, slice(None))], WIDTH, HEIGHT):
                 grey = np.where(seen, 230, wall).astype(np.uint8).reshape(HEIGHT, WIDTH)
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(np.dstack([grey] * 3), format="rgb24")))
             container.mux(stream.encode())
@@ -310,6 +316,29 @@ def test_stretches_are_those_in_which_most_moves() -> None:
     assert choose_windows(np.zeros(90), ContentOptions()) == [range(90)]
     assert choose_windows(np.zeros(410), ContentOptions()) == [range(205), range(205, 410)]
     assert find_offsets({}, 5) == {}
+
+
+@pytest.mark.parametrize(
+    ("shown", "still", "asked"),
+    [
+        ([min(k, 39) for k in range(FRAMES)], 40, "did it hang, or was its rate converted"),
+        ([k - k % 2 for k in range(FRAMES)], 40, "did it hang, or was its rate converted"),
+        ([0] * FRAMES, FRAMES - 1, "is its lens covered, or did it hang"),
+        ([k - (k in (20, 50)) for k in range(FRAMES)], 0, ""),
+    ],
+)
+def test_a_camera_that_repeats_pictures_is_named(tmp_path: Path, shown: list[int], still: int, asked: str) -> None:
+    site = Site(tmp_path / "store", tmp_path / "capture", 1)
+    film(site.capture, {}, repeated={2: shown})
+    write_times(site.capture, {})
+    groups, rig = synchronized(site, tmp_path / "sync"), put(site, "rig", lambda out: calibrated().save(out / RIG))
+    take = Take(groups=groups, rig=rig, cameras=NAMES)
+    notes, _ = build_here(FindMotion(take=take, options=MOTION_OPTIONS), site, tmp_path / "motion")
+    assert notes.get(REPEATS, {}) == ({"cam2": [still, FRAMES - 1]} if still else {})
+    told = list(repeats_told(notes))
+    assert len(told) == bool(still)
+    assert not still or f"cam2: {still} of {FRAMES - 1} pictures repeat the one before" in told[0]
+    assert not still or asked in told[0]
 
 
 def test_a_single_instant_has_no_motion(tmp_path: Path) -> None:

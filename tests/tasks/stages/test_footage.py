@@ -18,7 +18,7 @@ from tasks.artefacts.recipe import canonical
 from tasks.artefacts.stage import Files, Site
 from tasks.artefacts.store import Key
 from tasks.stages.footage import RIG, Footage, PictureOptions, Take
-from tasks.stages.synchronize import Synchronize, read_videos
+from tasks.stages.synchronize import FOOTAGE, Synchronize, read_videos
 from tests.support.artefacts import build_here, put
 from tests.support.calibration_scene import ring
 from tests.support.planes import write_planes
@@ -78,6 +78,19 @@ def test_log_becomes_the_picture_that_was_filmed(site: Site, groups: Key) -> Non
         assert np.abs(picture.astype(int) - scene()).max() <= NEAR
     views = footage.open_views()
     assert np.array_equal(views.pixels(0, 1), footage.filmed(1)["cam00"])
+
+
+def test_a_video_that_two_cameras_have_is_named(site: Site, tmp_path: Path) -> None:
+    def noted(**sha256: str) -> list[str]:
+        stage = Synchronize(
+            videos=Files(sha256), timecodes=Files({}), fps=None, timecode_column=None, options=AlignOptions()
+        )
+        notes, _ = build_here(stage, site, tmp_path / "sync")
+        return [note for note in notes.get(FOOTAGE, []) if "to the byte" in note]
+
+    assert not noted(cam00="a", cam01="b", cam02="c")
+    (note,) = noted(cam00="a", cam01="b", cam02="a")
+    assert note.startswith("the videos of cam00 and cam02 are the same to the byte")
 
 
 def test_log_that_nobody_called_so_is_suspected(site: Site, groups: Key) -> None:
