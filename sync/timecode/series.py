@@ -109,7 +109,8 @@ def unwrapped(times_ns: np.ndarray, unit_ns: int) -> tuple[np.ndarray, int, int]
     steps = np.diff(times_ns)
     forward = steps[steps > 0]
     period = int(np.median(forward)) if len(forward) else 0
-    within = [cycle for cycle in CLOCK_CYCLES_NS if times_ns.min() >= 0 and times_ns.max() < cycle]
+    least, most = times_ns.min(initial=0), times_ns.max(initial=0)
+    within = [cycle for cycle in CLOCK_CYCLES_NS if least >= 0 and most < cycle]
     for cycle in sorted({*(bits * unit_ns for bits in CYCLES), DAY_NS, *within}):
         if not FEWEST_PERIODS * period <= cycle < TIME_LIMIT_NS or not period:
             continue
