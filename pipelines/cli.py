@@ -44,6 +44,9 @@ SINGLE = {
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "spz3", "sog", "splat", "gltf", "usd", "4dgs")
 """What `packuv.interchange` writes, which is too heavy to be asked before a command is chosen"""
 
+READ = ("scene", "inputs", "path", "compare")
+"""Arguments that name files which a command reads"""
+
 WRONG_PATH = frozenset({errno.ENAMETOOLONG, errno.ELOOP})
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
@@ -110,6 +113,7 @@ def _outcome(words: Sequence[str]) -> int:
     arguments = argparse.Namespace()
     try:
         arguments = _parsed(words)
+        _check_output(arguments)
         return _load(arguments.function)(arguments)
     except UsageError as error:
         return _say(WRONG, (words and plugins.missing(words[0])) or error)
@@ -139,6 +143,15 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     except SystemExit:  # after --help and --version, which are an answer, too
         check_written()
         raise
+
+
+def _check_output(arguments: argparse.Namespace) -> None:
+    """Raise ValueError where the file to write is one that the command reads."""
+    if (output := getattr(arguments, "output", None)) and output.exists():
+        from packuv.files import check_apart
+
+        named = [getattr(arguments, name, None) or () for name in READ]
+        check_apart(output, [path for paths in named for path in ([paths] if isinstance(paths, Path) else paths)])
 
 
 def _load(name: str) -> Callable[[argparse.Namespace], int]:

@@ -273,3 +273,37 @@ def test_nothing_is_left_behind_by_what_fails(scene, tmp_path):
     assert run("export", scene, "--frame", 9, "-o", tmp_path / "a.ply") == WRONG
     assert run("export", scene, "--frame", 0, "-o", tmp_path / "none" / "a.ply") == WRONG
     assert [path.name for path in tmp_path.iterdir()] == ["junk.ply"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["export", "{scene}", "--frame", "0", "--format", "ply"],
+        ["export", "atlas", "{scene}", "--map", "64"],
+        ["atlas", "{scene}", "--frame", "0"],
+        ["compress", "{scene}", "--ratio", "1.5"],
+        ["import", "{scene}"],
+    ],
+)
+def test_what_is_read_is_not_written_over(scene, tmp_path, words, capsys):
+    own = tmp_path / "own.mkv"
+    own.write_bytes(scene.read_bytes())
+    other = tmp_path / "link.mkv"
+    other.symlink_to(own)
+    for output in (own, other):
+        assert run(*(word.format(scene=own) for word in words), "-o", output) == WRONG
+        assert "name another file to write" in capsys.readouterr().err
+    assert own.read_bytes() == scene.read_bytes()
+    assert other.is_symlink()
+
+
+def test_splat_files_are_not_written_over(scene, tmp_path, capsys):
+    frames = tmp_path / "frames"
+    assert run("export", scene, "--frames", "0:2", "-o", frames) == OK
+    before = {path: path.read_bytes() for path in frames.iterdir()}
+    for source in (frames, frames / "000001.ply"):
+        assert run("import", source, "-o", frames / "000001.ply") == WRONG
+        assert "name another file to write" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in frames.iterdir()} == before
+    assert run("import", frames, "-o", tmp_path) == WRONG
+    assert f"{tmp_path} is a folder; name a file to write" in capsys.readouterr().err
