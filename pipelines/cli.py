@@ -53,6 +53,8 @@ FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 MOST_SAID = 2000
 """Characters of a message"""
+MOST_RATE_PART = 2**31 - 1
+"""As in `packuv.bounds`, which is too heavy to be asked before a command is chosen"""
 
 
 class UsageError(ValueError):
@@ -726,9 +728,13 @@ def _range_text(text: str) -> str:
 
 def _rate(text: str) -> Fraction:
     match = re.fullmatch(r"\d+(?:\.\d+)?|\d+/[1-9]\d*", text)
-    if not match or not Fraction(text) > 0:
-        raise argparse.ArgumentTypeError(f"must be a rate above 0 as 30, 29.97 or 30000/1001, but is {text!r}")
-    return Fraction(text)
+    rate = Fraction(text) if match else Fraction(0)
+    if not rate > 0 or max(rate.numerator, rate.denominator) > MOST_RATE_PART:
+        raise argparse.ArgumentTypeError(
+            "must be a rate above 0 as 30, 29.97 or 30000/1001, both parts of the fraction up to "
+            f"{MOST_RATE_PART}, but is {text!r}"
+        )
+    return rate
 
 
 def _names(text: str) -> tuple[str, ...]:
