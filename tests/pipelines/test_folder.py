@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.folder import claim
+from pipelines.folder import IDENTITY, claim
 from sync.capture import find_capture
 
 
@@ -37,3 +37,14 @@ def test_a_capture_that_was_moved_keeps_its_results(tmp_path):
     shutil.rmtree(moved)
     with pytest.raises(ValueError, match=r"holds the results of .*archive/dance"):
         claim(results, find_capture(other))
+
+
+@pytest.mark.parametrize("damage", [b"", b'{"capture": "/sh', b"[]", b"{}", b"\xff"])
+def test_a_folder_that_does_not_tell_whose_it_is_is_named(tmp_path, damage):
+    capture, results = find_capture(_capture(tmp_path / "dance")), tmp_path / "runs" / "dance"
+    claim(results, capture)
+    (results / IDENTITY).write_bytes(damage)
+    with pytest.raises(ValueError, match=rf"runs/dance/{IDENTITY} must tell whose results lie beside it"):
+        claim(results, capture)
+    (results / IDENTITY).unlink()
+    claim(results, capture)
