@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 from dataclasses import replace
 from fractions import Fraction
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 from calibration.importers import load_rig
+from packuv import score
 from packuv.atlas import AtlasVideo
 from packuv.camera import PinholeCamera
 from packuv.colour import lit
@@ -21,7 +24,7 @@ from packuv.gaussians.segment import Segment
 from packuv.interchange import read_gaussians
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.score import Artist
-from pipelines.cli import OK, WRONG, main
+from pipelines.cli import FAILED, OK, WRONG, main
 
 ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 
@@ -307,3 +310,17 @@ def test_splat_files_are_not_written_over(scene, tmp_path, capsys):
     assert {path: path.read_bytes() for path in frames.iterdir()} == before
     assert run("import", frames, "-o", tmp_path) == WRONG
     assert f"{tmp_path} is a folder; name a file to write" in capsys.readouterr().err
+
+
+def test_pictures_are_whole_or_not_there(scene, tmp_path, monkeypatch, capsys):
+    def on_a_full_disk(path, picture):
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(score, "write_picture", on_a_full_disk)
+    assert run("render", scene, "--camera", "a", "-o", tmp_path) == FAILED
+    assert "No space left on device" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    assert run("render", scene, "--camera", "a", "--frames", "1:3", "-o", tmp_path) == OK
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000001.png", "000002.png"]
