@@ -405,7 +405,7 @@ def _serve(command: argparse.ArgumentParser) -> None:
     command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
     command.add_argument("--at-once", type=_positive, default=1, metavar="N", help="runs at a time")
     command.add_argument("--host", default="127.0.0.1", help="address of the dashboard, which has no password")
-    command.add_argument("--port", type=_positive, default=4200, help="of the dashboard")
+    command.add_argument("--port", type=_port, default=4200, help="of the dashboard")
 
 
 def _worker(command: argparse.ArgumentParser) -> None:
@@ -690,6 +690,13 @@ def _positive(text: str) -> int:
     number = int(text) if re.fullmatch(r"\d+", text) else 0
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1 on, but is {text!r}")
+    return number
+
+
+def _port(text: str) -> int:
+    number = int(text) if re.fullmatch(r"\d{1,5}", text) else 0
+    if not 0 < number < 2**16:
+        raise argparse.ArgumentTypeError(f"must be a port from 1 to {2**16 - 1}, but is {text!r}")
     return number
 
 

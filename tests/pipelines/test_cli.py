@@ -57,6 +57,8 @@ from tests.packuv.test_score import LIGHT, write_wall
         (["atlas", "nowhere.mkv", "--frame", "0", "-o", "a.png"], "nowhere.mkv"),
         (["web", "nowhere.mkv", "-o", "site"], "nowhere.mkv"),
         (["verify"], "one of the arguments SCENE --store is required"),
+        (["serve", "--out", "o", "--port", "99999"], "must be a port from 1 to 65535, but is '99999'"),
+        (["serve", "--out", "o", "--data", "nowhere"], "no manifest or folder of captures nowhere"),
         (["run", "nowhere", "--out", "o"], "no capture folder"),
         (["run", "nowhere", "--out", "o", "--set", "fit.iterations"], "--set needs NAME=VALUE"),
         (["run", "nowhere", "--out", "o", "--config", "none.toml"], "no file none.toml; --config needs a TOML file"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.folder import IDENTITY, claim
+from pipelines.server import own_home, serving
 from sync.capture import find_capture
 
 
@@ -48,3 +49,12 @@ def test_a_folder_that_does_not_tell_whose_it_is_is_named(tmp_path, damage):
         claim(results, capture)
     (results / IDENTITY).unlink()
     claim(results, capture)
+
+
+def test_who_serves_a_folder_that_is_served_is_told_so(tmp_path):
+    told = pytest.raises(ValueError, match="is running already; end that one first")
+    with own_home(tmp_path, "serve"), told, own_home(tmp_path, "serve"):
+        pass
+    told = pytest.raises(ValueError, match="is running already: http://a/api; end that one first")
+    with serving(tmp_path, "http://a/api"), told, serving(tmp_path, "http://b/api"):
+        pass
