@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from threading import RLock
@@ -86,6 +86,13 @@ def check_place(path: Path) -> None:
         raise FileNotFoundError(f"no folder {path.parent} to write {path.name} in; make it first")
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; name a file to write")
+
+
+def check_apart(path: Path, sources: Iterable[Path]) -> None:
+    """Raise ValueError where a file to write is one of those that are read: it would be gone."""
+    for source in sources:
+        if path.exists() and source.exists() and path.samefile(source):
+            raise ValueError(f"{path} is read, so that nothing else may be written there; name another file to write")
 
 
 @contextmanager

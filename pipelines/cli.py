@@ -44,12 +44,17 @@ SINGLE = {
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "spz3", "sog", "splat", "gltf", "usd", "4dgs")
 """What `packuv.interchange` writes, which is too heavy to be asked before a command is chosen"""
 
+READ = ("scene", "inputs", "path", "compare")
+"""Arguments that name files which a command reads"""
+
 WRONG_PATH = frozenset({errno.ENAMETOOLONG, errno.ELOOP})
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 MOST_SAID = 2000
 """Characters of a message"""
+MOST_RATE_PART = 2**31 - 1
+"""As in `packuv.bounds`, which is too heavy to be asked before a command is chosen"""
 
 
 class UsageError(ValueError):
@@ -110,6 +115,7 @@ def _outcome(words: Sequence[str]) -> int:
     arguments = argparse.Namespace()
     try:
         arguments = _parsed(words)
+        _check_output(arguments)
         return _load(arguments.function)(arguments)
     except UsageError as error:
         return _say(WRONG, (words and plugins.missing(words[0])) or error)
@@ -139,6 +145,15 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     except SystemExit:  # after --help and --version, which are an answer, too
         check_written()
         raise
+
+
+def _check_output(arguments: argparse.Namespace) -> None:
+    """Raise ValueError where the file to write is one that the command reads."""
+    if (output := getattr(arguments, "output", None)) and output.exists():
+        from packuv.files import check_apart
+
+        named = [getattr(arguments, name, None) or () for name in READ]
+        check_apart(output, [path for paths in named for path in ([paths] if isinstance(paths, Path) else paths)])
 
 
 def _load(name: str) -> Callable[[argparse.Namespace], int]:
@@ -390,7 +405,7 @@ def _serve(command: argparse.ArgumentParser) -> None:
     command.add_argument("--preset", choices=PRESETS, default="standard", help="trades time for quality")
     command.add_argument("--at-once", type=_positive, default=1, metavar="N", help="runs at a time")
     command.add_argument("--host", default="127.0.0.1", help="address of the dashboard, which has no password")
-    command.add_argument("--port", type=_positive, default=4200, help="of the dashboard")
+    command.add_argument("--port", type=_port, default=4200, help="of the dashboard")
 
 
 def _worker(command: argparse.ArgumentParser) -> None:
@@ -678,6 +693,13 @@ def _positive(text: str) -> int:
     return number
 
 
+def _port(text: str) -> int:
+    number = int(text) if re.fullmatch(r"\d{1,5}", text) else 0
+    if not 0 < number < 2**16:
+        raise argparse.ArgumentTypeError(f"must be a port from 1 to {2**16 - 1}, but is {text!r}")
+    return number
+
+
 def _days(text: str) -> float:
     if not re.fullmatch(r"\d+(?:\.\d+)?", text):
         raise argparse.ArgumentTypeError(f"must be a number of days, but is {text!r}")
@@ -713,9 +735,13 @@ def _range_text(text: str) -> str:
 
 def _rate(text: str) -> Fraction:
     match = re.fullmatch(r"\d+(?:\.\d+)?|\d+/[1-9]\d*", text)
-    if not match or not Fraction(text) > 0:
-        raise argparse.ArgumentTypeError(f"must be a rate above 0 as 30, 29.97 or 30000/1001, but is {text!r}")
-    return Fraction(text)
+    rate = Fraction(text) if match else Fraction(0)
+    if not rate > 0 or max(rate.numerator, rate.denominator) > MOST_RATE_PART:
+        raise argparse.ArgumentTypeError(
+            "must be a rate above 0 as 30, 29.97 or 30000/1001, both parts of the fraction up to "
+            f"{MOST_RATE_PART}, but is {text!r}"
+        )
+    return rate
 
 
 def _names(text: str) -> tuple[str, ...]:

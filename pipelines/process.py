@@ -366,7 +366,8 @@ def plan_of(request: RunRequest, capture: Capture) -> Plan:
     first, stop = request.instants
     held_out = capture.settings.held_out if request.hold_out is None else request.hold_out
     device, side_by_side = choose_device(request.device), jobs_at_once(request) > 1
-    return Plan(capture.folder, capture.videos, tuple(held_out), first, stop, device, side_by_side)
+    named_once = tuple(dict.fromkeys(held_out))
+    return Plan(capture.folder, capture.videos, named_once, first, stop, device, side_by_side)
 
 
 def jobs_of(request: RunRequest) -> Jobs:

@@ -191,12 +191,12 @@ def _results(address: str, out: Path) -> dict[str, str]:
 
 @contextlib.contextmanager
 def serving(out: Path, address: str) -> Iterator[None]:
-    """Have runs under this output folder find the server; raises RuntimeError where another one serves it."""
+    """Have runs under this output folder find the server; raises ValueError where another one serves it."""
     place = out.absolute() / ".prefect"
     place.mkdir(parents=True, exist_ok=True)
     with open(place / "serving.lock", "ab") as lock:
         if not try_lock(lock.fileno()):
-            raise RuntimeError(f"a packuv serve for {out} is running already: {find_served(out)}")
+            raise ValueError(f"a packuv serve for {out} is running already: {find_served(out)}; end that one first")
         write_json(place / "serving.json", {"api": address})
         try:
             yield
@@ -242,12 +242,12 @@ def override(values: Mapping[str, str], *, keep: bool = False) -> Iterator[None]
 
 @contextlib.contextmanager
 def own_home(out: Path, name: str) -> Iterator[tuple[Path, BinaryIO]]:
-    """The one folder of a server that stays; raises RuntimeError where it is in use."""
+    """The one folder of a server that stays; raises ValueError where it is in use."""
     home = out.absolute() / ".prefect" / name
     home.mkdir(parents=True, exist_ok=True)
     with open(home / "in_use.lock", "ab") as lock:
         if not try_lock(lock.fileno()):
-            raise RuntimeError(f"{home} is in use: a packuv serve for {out} is running already")
+            raise ValueError(f"{home} is in use: a packuv serve for {out} is running already; end that one first")
         yield home, lock
 
 

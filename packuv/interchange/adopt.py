@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from packuv.bounds import MOST_NUMBER
+from packuv.files import check_apart, check_place
 from packuv.gaussians.codes import OPACITY, OPACITY_RANGE, SCALE, Codes, Quantizer, attribute_values
 from packuv.gaussians.floats import DRAWN_LOGIT, SH_C0, Gaussians, drawn, opacity, rows_of, with_canonical_axes
 from packuv.gaussians.orbit import OrbitOptions, around, middle, near_of, orbit
@@ -43,6 +44,8 @@ SEEN_LOG_SCALE = 1.0
 """The same of a log scale"""
 MOST_VALUE = MOST_NUMBER / 10
 """Of a sound Gaussian: the ranges of codes, which reach a little farther, end at MOST_NUMBER"""
+LEAST_TURN = 1e-10
+"""Of the largest component of a quaternion that still tells a rotation: shorter ones are not brought to length 1"""
 ROTATION_REACH = 0.7072
 """x, y and z of a canonical rotation are at most the square root of one half."""
 
@@ -141,10 +144,11 @@ def adopt(frames: Sequence[Path], out: Path, *, options: AdoptOptions, progress:
     """Write a scene file of splat files, one a frame, and tell what was lost.
 
     Every file is read twice, at most one segment is in memory. A frame may be empty. Raises ValueError for files
-    without any drawn Gaussian or of different SH degrees, FileNotFoundError for missing ones.
+    without any drawn Gaussian or of different SH degrees, or for an `out` that is one of them, FileNotFoundError for
+    missing ones.
     """
-    if not out.parent.is_dir():
-        raise FileNotFoundError(f"no folder {out.parent} to write {out.name} in; make it first")
+    check_place(out)
+    check_apart(out, frames)
     count, steps = len(frames), 4 * len(frames)  # survey, map, encode, verify
     survey = _Survey(options)
     for done, path in enumerate(frames, start=1):
@@ -208,9 +212,9 @@ class Frame:
 def read_frame(path: Path, *, sh_degree: int | None) -> Frame:
     """The Gaussians of a file, and the number of those that are not drawn."""
     whole = read_gaussians(path, sh_degree=sh_degree)
-    values = (whole.means, whole.log_scales, whole.quaternions, whole.sh)
+    values = (whole.means, np.exp(whole.log_scales), whole.quaternions, whole.sh)
     sound = np.logical_and.reduce([(np.abs(v) < MOST_VALUE).all(axis=tuple(range(1, v.ndim))) for v in values])
-    sound &= whole.quaternions.any(axis=1) & ~np.isnan(whole.opacity_logits)
+    sound &= (np.abs(whole.quaternions) > LEAST_TURN).any(axis=1) & ~np.isnan(whole.opacity_logits)
     kept, lost = drawn(rows_of(whole, sound)), rows_of(whole, ~sound)
     seen = np.isnan(lost.opacity_logits) | (lost.opacity_logits >= DRAWN_LOGIT)  # what is faint is not missed
     alpha = np.nan_to_num(opacity(lost)[seen], nan=1.0)

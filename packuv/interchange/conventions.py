@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,17 +15,20 @@ ABSENT_LOGIT = -20.0
 """For an alpha of 0, of a row that is kept for its number: float32 has 2e-9, 8 bits have 0"""
 FLATNESS = np.log(100.0)
 """An axis of no thickness is so much thinner, natural logarithm, than the thinnest of its Gaussian that has some"""
+NO_LOG_SCALE = math.log(np.finfo(np.float32).tiny)
+"""A log scale below is none: its thickness is 0 as float32, or next to it"""
 LEAST_LOG_SCALE = -20.0
 """Of a Gaussian without any size"""
 
 
 def finite(gaussians: Gaussians) -> Gaussians:
-    """Infinite values that mean something, as finite ones: opacity logits of +inf are alpha 1, log scales of -inf flat.
+    """Infinite values that mean something, as finite ones: opacity logits of +inf are alpha 1, log scales of -inf flat,
+    and those below NO_LOG_SCALE.
 
     Opacities of -inf and what is not a number stay.
     """
     scales, logits = gaussians.log_scales, gaussians.opacity_logits
-    flat, opaque = np.isneginf(scales), np.isposinf(logits)
+    flat, opaque = scales < NO_LOG_SCALE, np.isposinf(logits)
     if flat.any():
         thinnest = np.where(flat, np.inf, scales).min(axis=1)
         thin = np.where(np.isposinf(thinnest), LEAST_LOG_SCALE, thinnest - FLATNESS)

@@ -184,7 +184,9 @@ def _unpacked(unpacker: Any, size: int) -> bytes:
     """The body, and not more of what follows it than tells that its checksum is right."""
     body: bytes = unpacker.decompress(unpacker.unconsumed_tail, size) if size else b""
     if not unpacker.eof and len(body) == size:
-        unpacker.decompress(unpacker.unconsumed_tail, 1)
+        more = unpacker.decompress(unpacker.unconsumed_tail, 1)
+        if not more and not unpacker.eof:
+            raise ValueError("the end of its gzip stream, with the checksum, is missing; it is cut short")
     return body
 
 

@@ -24,6 +24,9 @@ from tasks.report.write import JSON_NAME, PAGE_NAME
 STATES = {"finished": "finished", "cancelled": "cancelled", "stopped": "cancelled"}
 """By how a run ended, what the page calls it; all else has failed"""
 
+PARTS = {"run": dict, "summary": dict, "scores": list, "findings": list}
+"""Of report.json, of every version"""
+
 
 def command(arguments: argparse.Namespace) -> int:
     """Exit code 0 if what was asked for is written."""
@@ -70,7 +73,7 @@ def read_report(path: Path) -> dict[str, Any]:
         told = json.loads(file.read_text())
     except ValueError:
         told = None
-    if not (isinstance(told, dict) and isinstance(told.get("run"), dict) and isinstance(told.get("summary"), dict)):
+    if not isinstance(told, dict) or any(not isinstance(told.get(name), kind) for name, kind in PARTS.items()):
         raise ValueError(f"{file} must be a {JSON_NAME} as packuv writes it, but is none; name the folder of a run")
     return told
 
@@ -138,16 +141,16 @@ def _line(place: Path, folder: Path) -> Line:
         report = read_report(place)
     except (ValueError, FileNotFoundError) as error:
         return Line(**{**line, "status": "failed", "reason": str(error)})
-    figures, size = report["summary"], report["summary"]["mb_per_30_frames"]
+    figures, size = report["summary"], report["summary"].get("mb_per_30_frames")
     scene = place / "scene.mkv"
     return Line(
         **line,
-        psnr_db=figures["psnr_db"],
-        ssim=figures["ssim"],
-        unseen=bool(figures["held_out"]),
+        psnr_db=figures.get("psnr_db"),
+        ssim=figures.get("ssim"),
+        unseen=bool(figures.get("held_out")),
         mb_per_frame=None if size is None else size / 30,
-        frames=figures["frames"],
-        hours=None if figures["seconds"] is None else figures["seconds"] / 3600,
+        frames=figures.get("frames"),
+        hours=None if (seconds := figures.get("seconds")) is None else seconds / 3600,
         findings=len(report["findings"]),
         verdict=(report.get("verdict") or {}).get("text", ""),
         report=os.path.relpath(place / PAGE_NAME, folder),

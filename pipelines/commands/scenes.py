@@ -188,6 +188,7 @@ def _verify_store(arguments: argparse.Namespace) -> int:
 def render(arguments: argparse.Namespace) -> int:
     """`packuv render`: <frame>.png for each frame in its light, numbered as in the scene."""
     from packuv.colour import lit
+    from packuv.files import whole_file
     from packuv.fit.device import choose_device
     from packuv.scene import open_scene
     from packuv.score import Artist, write_picture
@@ -202,7 +203,8 @@ def render(arguments: argparse.Namespace) -> int:
         artist = Artist(scene, device)
         for done, frame in enumerate(frames, start=1):
             picture = lit(artist.draw(scene.gaussians(frame), camera), scene.light(frame))
-            write_picture(arguments.output / f"{frame:06d}.png", picture)
+            with whole_file(arguments.output / f"{frame:06d}.png") as part:
+                write_picture(part, picture)
             progress(done, len(frames))
     size = f"{camera.width}x{camera.height}"
     print(f"{arguments.output}: {len(frames)} pictures of camera {camera.name}, {size}")

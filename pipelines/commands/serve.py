@@ -13,14 +13,16 @@ from pipelines.server import DATABASE, QUIET, Server, named_server, override, ow
 
 def serve(arguments: argparse.Namespace) -> int:
     """`packuv serve`: until Ctrl-C or SIGTERM."""
-    out = Path(os.path.abspath(arguments.out))
+    out, data = Path(os.path.abspath(arguments.out)), arguments.data
+    if data and not data.exists():
+        raise FileNotFoundError(f"no manifest or folder of captures {data}; name one that is there with --data")
     out.mkdir(parents=True, exist_ok=True)
     with _server(out, arguments.host, arguments.port) as server:
         from pipelines.deploy import ServeOptions, serve_deployments  # takes seconds, in which the server starts
 
         options = ServeOptions(
             out=out,
-            data=arguments.data and Path(os.path.abspath(arguments.data)),
+            data=data and Path(os.path.abspath(data)),
             cron=arguments.cron,
             timezone=arguments.timezone,
             preset=arguments.preset,

@@ -161,7 +161,10 @@ class Store:
         return self._folder(key)
 
     def receipt(self, key: Key) -> Receipt:
-        """Receipt of a complete artefact; raises FileNotFoundError where there is none."""
+        """Receipt of a complete artefact.
+
+        Raises FileNotFoundError where there is none, ValueError for a damaged one.
+        """
         return _receipt(self._folder(key))
 
     def make(
@@ -225,8 +228,11 @@ class Store:
 
     def absent(self) -> set[str]:
         """Names of artefacts that others were made from and that are not here any more, as after `packuv clean`."""
-        present = {str(key) for key in self.keys()}
-        return {name for key in self.keys() for name in _names(self.receipt(key).recipe["inputs"])} - present
+        present, wanted = {str(key) for key in self.keys()}, set[str]()
+        for key in self.keys():
+            with contextlib.suppress(ValueError):  # damaged, as `verify` tells
+                wanted.update(_names(self.receipt(key).recipe.get("inputs")))
+        return wanted - present
 
     @contextlib.contextmanager
     def in_use(self) -> Iterator[Path]:
@@ -420,7 +426,12 @@ class Store:
         shutil.rmtree(self.work_folder(key), ignore_errors=True)
 
     def _audit(self, key: Key) -> Iterator[Damage]:
-        folder, receipt = self._folder(key), self.receipt(key)
+        folder = self._folder(key)
+        try:
+            receipt = self.receipt(key)
+        except ValueError:
+            yield Damage(key, RECEIPT, "is none that a store writes")
+            return
         if recipe.digest(receipt.recipe) != key.digest:
             yield Damage(key, RECEIPT, "does not hold the recipe that names this folder")
         for name, item in receipt.outputs.items():
@@ -431,14 +442,25 @@ class Store:
 
 
 def _receipt(folder: Path) -> Receipt:
-    return Receipt(**json.loads((folder / RECEIPT).read_text()))
+    """Raises FileNotFoundError, or ValueError for what is no receipt."""
+    text = (folder / RECEIPT).read_bytes()
+    try:
+        receipt = Receipt(**json.loads(text))
+        outputs = {name: {"sha256": item["sha256"], "bytes": item["bytes"]} for name, item in receipt.outputs.items()}
+        return replace(receipt, recipe=dict(receipt.recipe), outputs=outputs)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(
+            f"{folder / RECEIPT} must be a receipt as a store writes it, but is damaged ({error}); delete {folder} and "
+            "run again"
+        ) from None
 
 
 def _is_whole(folder: Path) -> bool:
+    """Where the receipt is damaged nobody knows what else is, so the artefact is made again."""
     try:
         outputs = _receipt(folder).outputs
         return all((folder / name).stat().st_size == item["bytes"] for name, item in outputs.items())
-    except FileNotFoundError:
+    except (FileNotFoundError, ValueError):
         return False
 
 

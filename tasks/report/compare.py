@@ -89,7 +89,7 @@ def differences(a: Report, b: Report) -> Iterator[Difference]:
     """What differs between two reports: settings, versions, of stages too, figures, cameras' scores, findings; in this
     order."""
     for kind, name in (("setting", "options"), ("version", "versions")):
-        yield from _fields(kind, _flat(a["run"][name] or {}), _flat(b["run"][name] or {}))
+        yield from _fields(kind, _flat(a["run"].get(name) or {}), _flat(b["run"].get(name) or {}))
     yield from _fields("stage version", *(report["run"].get("stage_versions", {}) for report in (a, b)))
     yield from _fields("figure", *(_figures(report) for report in (a, b)))
     yield from _fields("camera", _levels(a), _levels(b))

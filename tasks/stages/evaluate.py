@@ -157,7 +157,7 @@ def evaluate_scene(
         header = opened.header
         lenses = _lenses(header)
         fitted = [name for name in lenses if name not in header.held_out]
-        names = tuple(cameras or header.held_out) or spread(fitted, options.fitted_cameras)
+        names = tuple(dict.fromkeys(cameras or header.held_out)) or spread(fitted, options.fitted_cameras)
         if unknown := [name for name in names if name not in lenses]:
             raise ValueError(f"the scene has no camera {', '.join(unknown)}; it has {', '.join(lenses) or 'none'}")
         matched = capture if isinstance(capture, Matched) else match(header, capture)

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from packuv import bounds
 from pipelines import cli
-from pipelines.cli import FAILED, INTERRUPTED, OK, WRONG, main, parser
+from pipelines.cli import FAILED, INTERRUPTED, MOST_RATE_PART, OK, WRONG, main, parser
 from pipelines.commands.run import request_from
 from pipelines.request import RunRequest, read_settings
 from tests.packuv.test_score import LIGHT, write_wall
@@ -51,9 +52,13 @@ from tests.packuv.test_score import LIGHT, write_wall
         (["export", "atlas", "a.mkv", "-o", "b.mkv", "--map", "100"], "choose multiples"),
         (["import", "nowhere.ply", "-o", "a.mkv"], "no splat file or folder nowhere.ply"),
         (["import", "a.ply", "--fps", "0", "-o", "a.mkv"], "must be a rate above 0 as 30, 29.97 or 30000/1001"),
+        (["import", "a.ply", "--fps", "29.97002997002997", "-o", "a.mkv"], "parts of the fraction up to 2147483647"),
+        (["film", "a.mkv", "p.json", "--fps", "1/2147483648", "-o", "a.mp4"], "both parts of the fraction up to"),
         (["atlas", "nowhere.mkv", "--frame", "0", "-o", "a.png"], "nowhere.mkv"),
         (["web", "nowhere.mkv", "-o", "site"], "nowhere.mkv"),
         (["verify"], "one of the arguments SCENE --store is required"),
+        (["serve", "--out", "o", "--port", "99999"], "must be a port from 1 to 65535, but is '99999'"),
+        (["serve", "--out", "o", "--data", "nowhere"], "no manifest or folder of captures nowhere"),
         (["run", "nowhere", "--out", "o"], "no capture folder"),
         (["run", "nowhere", "--out", "o", "--set", "fit.iterations"], "--set needs NAME=VALUE"),
         (["run", "nowhere", "--out", "o", "--config", "none.toml"], "no file none.toml; --config needs a TOML file"),
@@ -87,6 +92,10 @@ def test_every_command_explains_itself(command, capsys):
     text = capsys.readouterr().out
     assert f"usage: packuv {command}".strip() in text
     assert "None" not in text
+
+
+def test_rates_end_where_those_of_files_do():
+    assert MOST_RATE_PART == bounds.MOST_RATE_PART
 
 
 def test_help_imports_nothing_heavy():

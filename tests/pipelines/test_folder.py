@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.folder import claim
+from pipelines.folder import IDENTITY, claim
+from pipelines.server import own_home, serving
 from sync.capture import find_capture
 
 
@@ -37,3 +38,23 @@ def test_a_capture_that_was_moved_keeps_its_results(tmp_path):
     shutil.rmtree(moved)
     with pytest.raises(ValueError, match=r"holds the results of .*archive/dance"):
         claim(results, find_capture(other))
+
+
+@pytest.mark.parametrize("damage", [b"", b'{"capture": "/sh', b"[]", b"{}", b"\xff"])
+def test_a_folder_that_does_not_tell_whose_it_is_is_named(tmp_path, damage):
+    capture, results = find_capture(_capture(tmp_path / "dance")), tmp_path / "runs" / "dance"
+    claim(results, capture)
+    (results / IDENTITY).write_bytes(damage)
+    with pytest.raises(ValueError, match=rf"runs/dance/{IDENTITY} must tell whose results lie beside it"):
+        claim(results, capture)
+    (results / IDENTITY).unlink()
+    claim(results, capture)
+
+
+def test_who_serves_a_folder_that_is_served_is_told_so(tmp_path):
+    told = pytest.raises(ValueError, match="is running already; end that one first")
+    with own_home(tmp_path, "serve"), told, own_home(tmp_path, "serve"):
+        pass
+    told = pytest.raises(ValueError, match="is running already: http://a/api; end that one first")
+    with serving(tmp_path, "http://a/api"), told, serving(tmp_path, "http://b/api"):
+        pass

@@ -25,7 +25,7 @@ from pipelines.cli import main
 from pipelines.commands.progress import TerminalProgress
 from pipelines.commands.scenes import _capture_of, _worst_frame, filmed
 from pipelines.events import Journal
-from pipelines.process import Engine, Outcome, jobs_of, process, process_directly
+from pipelines.process import Engine, Outcome, find_sequence, jobs_of, plan_of, process, process_directly
 from pipelines.request import RunRequest
 from studio.capture import SimulateOptions, TruthKind, simulate
 from studio.clocks import ClockOptions
@@ -149,6 +149,13 @@ def test_info_and_verify_tell_what_the_scene_is(first, capsys, tmp_path):
     found = json.loads(capsys.readouterr().out)
     assert found["bad"]
     assert found["span"][0] <= len(data) // 2 < found["span"][1]
+
+
+def test_a_camera_that_is_named_twice_counts_once(first, capture, tmp_path, capsys):
+    asked = request(capture, tmp_path, hold_out=("cam03", "cam05", "cam03"))
+    assert plan_of(asked, find_sequence(asked)).held_out == ("cam03", "cam05")
+    assert main(["eval", str(first[0].scene), str(capture), "--cameras", "cam03,cam03", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["cameras"] == ["cam03"]
 
 
 def test_a_report_written_anew_is_the_same_but_for_its_limits(first):

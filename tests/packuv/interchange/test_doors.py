@@ -82,6 +82,28 @@ def test_what_is_broken_counts_as_lost(tmp_path):
     assert (report.broken, report.faint, report.kept_share) == (10, 4, 86 / 96)
 
 
+@pytest.mark.parametrize("value", [-90, -103.3, -1e20])
+def test_what_has_no_thickness_as_float32_is_flat_and_spoils_no_range(tmp_path, value):
+    flat, like = room(), room()
+    flat.log_scales[:, 2], like.log_scales[:, 2] = value, -np.inf
+    for label, gaussians in (("a", flat), ("b", like)):
+        write_ply(tmp_path / f"{label}.ply", gaussians)
+        adopt([tmp_path / f"{label}.ply"], tmp_path / f"{label}.mkv", options=SMALL)
+    with open_scene(tmp_path / "a.mkv") as a, open_scene(tmp_path / "b.mkv") as b:
+        assert np.array_equal(a.gaussians(0).log_scales, b.gaussians(0).log_scales)
+
+
+def test_a_size_that_no_number_holds_or_a_rotation_of_no_length_is_broken(tmp_path):
+    truth = room(60)
+    truth.opacity_logits[:] = 1
+    truth.log_scales[3, 0], truth.log_scales[4] = 1e20, 90
+    truth.quaternions[5] *= 1e-15
+    write_ply(tmp_path / "a.ply", truth)
+    report = adopt([tmp_path / "a.ply"], tmp_path / "a.mkv", options=SMALL)
+    assert (report.broken, report.kept_share) == (3, 57 / 60)
+    assert min(report.psnr_db) > 40
+
+
 @pytest.mark.parametrize("value", [3e38, 1e37, -2e30])
 def test_what_is_absurd_is_broken(tmp_path, value):
     truth = room(60)

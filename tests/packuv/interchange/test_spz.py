@@ -243,6 +243,14 @@ def test_a_file_cut_or_changed_anywhere_is_read_or_refused_in_one_sentence(tmp_p
     assert "c.spz" in problem
 
 
+@pytest.mark.parametrize("lost", [1, 4, 8])
+def test_a_file_that_lost_its_checksum_is_cut_short(tmp_path, lost):
+    write_spz(tmp_path / "a.spz", random_gaussians(30, 1), version=3)
+    (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:-lost])
+    with pytest.raises(ValueError, match="the end of its gzip stream, with the checksum, is missing"):
+        read_spz(tmp_path / "a.spz")
+
+
 def test_what_it_cannot_hold_is_said(tmp_path):
     header, streams = stored_streams(random_gaussians(2, 0), tmp_path / "a.spz")
     body = b"".join(streams)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 from dataclasses import replace
 from fractions import Fraction
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 from calibration.importers import load_rig
+from packuv import score
 from packuv.atlas import AtlasVideo
 from packuv.camera import PinholeCamera
 from packuv.colour import lit
@@ -21,7 +24,7 @@ from packuv.gaussians.segment import Segment
 from packuv.interchange import read_gaussians
 from packuv.scene import SceneHeader, open_scene, write_scene
 from packuv.score import Artist
-from pipelines.cli import OK, WRONG, main
+from pipelines.cli import FAILED, OK, WRONG, main
 
 ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 
@@ -273,3 +276,51 @@ def test_nothing_is_left_behind_by_what_fails(scene, tmp_path):
     assert run("export", scene, "--frame", 9, "-o", tmp_path / "a.ply") == WRONG
     assert run("export", scene, "--frame", 0, "-o", tmp_path / "none" / "a.ply") == WRONG
     assert [path.name for path in tmp_path.iterdir()] == ["junk.ply"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["export", "{scene}", "--frame", "0", "--format", "ply"],
+        ["export", "atlas", "{scene}", "--map", "64"],
+        ["atlas", "{scene}", "--frame", "0"],
+        ["compress", "{scene}", "--ratio", "1.5"],
+        ["import", "{scene}"],
+    ],
+)
+def test_what_is_read_is_not_written_over(scene, tmp_path, words, capsys):
+    own = tmp_path / "own.mkv"
+    own.write_bytes(scene.read_bytes())
+    other = tmp_path / "link.mkv"
+    other.symlink_to(own)
+    for output in (own, other):
+        assert run(*(word.format(scene=own) for word in words), "-o", output) == WRONG
+        assert "name another file to write" in capsys.readouterr().err
+    assert own.read_bytes() == scene.read_bytes()
+    assert other.is_symlink()
+
+
+def test_splat_files_are_not_written_over(scene, tmp_path, capsys):
+    frames = tmp_path / "frames"
+    assert run("export", scene, "--frames", "0:2", "-o", frames) == OK
+    before = {path: path.read_bytes() for path in frames.iterdir()}
+    for source in (frames, frames / "000001.ply"):
+        assert run("import", source, "-o", frames / "000001.ply") == WRONG
+        assert "name another file to write" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in frames.iterdir()} == before
+    assert run("import", frames, "-o", tmp_path) == WRONG
+    assert f"{tmp_path} is a folder; name a file to write" in capsys.readouterr().err
+
+
+def test_pictures_are_whole_or_not_there(scene, tmp_path, monkeypatch, capsys):
+    def on_a_full_disk(path, picture):
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(score, "write_picture", on_a_full_disk)
+    assert run("render", scene, "--camera", "a", "-o", tmp_path) == FAILED
+    assert "No space left on device" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    assert run("render", scene, "--camera", "a", "--frames", "1:3", "-o", tmp_path) == OK
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000001.png", "000002.png"]

@@ -113,3 +113,18 @@ def test_what_is_no_run_is_said_in_a_sentence(
     assert main([word.format(tmp_path) for word in words]) == 2
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_report_that_lacks_something_harms_no_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b, c = (write_run(tmp_path / name, 25.0) for name in "abc")
+    told = json.loads((b / "report.json").read_text())
+    (b / "report.json").write_text(json.dumps({**told, "findings": None}))
+    (c / "report.json").write_text(json.dumps({"run": {}, "summary": {}, "scores": [], "findings": []}))
+    assert main(["report", "--compare", str(a), str(b)]) == 2
+    assert "must be a report.json as packuv writes it" in capsys.readouterr().err
+    assert main(["report", "--compare", str(a), str(c)]) == 0
+    capsys.readouterr()
+    assert main(["report", "--dataset", str(tmp_path), "--json"]) == 0
+    lines = {line["name"]: line for line in json.loads(capsys.readouterr().out)["sequences"]}
+    assert [lines[name]["status"] for name in "abc"] == ["finished", "failed", "finished"]
+    assert [lines[name]["psnr_db"] for name in "abc"] == [25.0, None, None]

@@ -269,6 +269,35 @@ def test_verify_finds_every_kind_of_damage(tmp_path):
     }
 
 
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        lambda text: b"",
+        lambda text: text[:-20],
+        lambda text: text.replace(b'"outputs"', b'"outputz"'),
+        lambda text: text.replace(b'"bytes"', b'"bytez"'),
+        lambda text: text.replace(b'"recipe": {', b'"recipe": 1, "n": {'),
+        lambda text: text.replace(b'"fit"', b'"fi\xff"'),
+        lambda text: b"[]",
+    ],
+)
+def test_an_artefact_whose_receipt_is_damaged_is_named_and_made_again(tmp_path, damaged):
+    store, log = Store(tmp_path), list[str]()
+    other = store.make("fit", 1, 2, {}, writes("text", log))
+    key = store.make("encode", 1, 3, {"fit": other}, writes("text", log))
+    for which in (key, other):
+        receipt = store.path(which) / RECEIPT
+        receipt.write_bytes(damaged(receipt.read_bytes()))
+    assert {(damage.key, damage.path) for damage in store.verify()} == {(key, RECEIPT), (other, RECEIPT)}
+    assert store.absent() == set()
+    assert not store.holds(key)
+    with pytest.raises(ValueError, match=rf"{RECEIPT} must be a receipt as a store writes it, but is damaged"):
+        store.receipt(key)
+    assert not store.make("fit", 1, 2, {}, writes("text", log)).reused
+    assert not store.make("encode", 1, 3, {"fit": other}, writes("text", log)).reused
+    assert store.verify() == []
+
+
 RACER = """
 import os, sys, time
 from tasks.artefacts.store import Store
