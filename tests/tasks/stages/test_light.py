@@ -192,7 +192,7 @@ def test_damaged_pictures_count_as_missing_from_then_on(tmp_path):
         (videos / "cam01" / f"{t:04d}.png").write_bytes(b"content")
     site = Site(tmp_path / "store", tmp_path / "capture", 2)
     sync = Synchronize(
-        videos=Files(dict.fromkeys(NAMES, "content")),
+        videos=Files({name: f"content of {name}" for name in NAMES}),
         timecodes=Files({}),
         fps=None,
         timecode_column=None,
