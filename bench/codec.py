@@ -74,10 +74,10 @@ CODECS = {
     "webp": Codec("libwebp", "bgra", (("lossless", "1"),)),
     "jxl": Codec("libjxl", "gray", (("distance", "0"), ("effort", "7"), ("modular", "1")), by_program=True),
 }
-PASSES = 3
-"""In which a scene file is read, to take the middle one's time"""
 ALONE = ("ffv1", "hevc")
 """Of these, those that also code the codes themselves: one that knows no other frame, and one that finds its own"""
+PASSES = 3
+"""In which a scene file is read, to take the middle one's time"""
 
 
 # The scene file

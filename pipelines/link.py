@@ -99,7 +99,8 @@ class Link:
                 self._wake.clear()
                 finished = self._finished.is_set()
                 if self._taken(client, lambda client: _hear(client, flow_run, jobs)):
-                    if self._send(client) & finished:
+                    sent = self._send(client)
+                    if sent and finished:
                         self._flushed.set()
                 elif not self._closed.is_set() and self._has_gone():
                     self._leave(str(client.api_url), jobs)

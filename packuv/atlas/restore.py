@@ -12,6 +12,7 @@ import numpy as np
 
 from packuv.atlas.picture import filled, read_triplets
 from packuv.atlas.video import AtlasVideo
+from packuv.files import check_place
 from packuv.gaussians.codes import Codes
 from packuv.gaussians.rows import joined_segment
 from packuv.gaussians.segment import Segment
@@ -39,8 +40,7 @@ def import_atlas(path: Path, out: Path, *, progress: Progress = no_progress) -> 
 
     A texel is one row of its segment. Raises what `AtlasVideo` raises, and ValueError for a frame without Gaussians.
     """
-    if not out.parent.is_dir():
-        raise FileNotFoundError(f"no folder {out.parent} to write {out.name} in; make it first")
+    check_place(out)
     video = AtlasVideo(path)
     steps, tally = 3 * len(video), _Tally()
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}.") as folder:
